@@ -1,0 +1,15 @@
+"""The foundation: statuses, messages, static sizes, safe maths, staging."""
+
+from ._checks import GeometryError as GeometryError
+from ._checks import check_shape as check_shape
+from ._checks import message as message
+from ._maths import prefix_sum as prefix_sum
+from ._maths import safe_divide as safe_divide
+from ._maths import safe_norm as safe_norm
+from ._maths import safe_normalize as safe_normalize
+from ._sizes import bucket as bucket
+from ._stage import runtime_token as runtime_token
+from ._stage import stage as stage
+from ._status import RESULTS as RESULTS
+from ._status import failure_where as failure_where
+from ._status import first_failure as first_failure

@@ -1,0 +1,6 @@
+"""The nouns: point clouds, triangle meshes, grids."""
+
+from ._cloud import PointCloud as PointCloud
+from ._cloud import stack as stack
+from ._grid import Grid as Grid
+from ._mesh import TriangleMesh as TriangleMesh
