@@ -10,6 +10,7 @@ from ._interpolation import splat_gradient as splat_gradient
 from ._multigrid import Multigrid as Multigrid
 from ._stencils import laplacian as laplacian
 from ._stencils import laplacian_diagonal as laplacian_diagonal
+from ._stencils import smooth as smooth
 from ._transfer import coarse_shape as coarse_shape
 from ._transfer import prolong as prolong
 from ._transfer import restrict as restrict

@@ -1,8 +1,8 @@
 """The Neumann Laplacian in the basis of cosines, where it is diagonal.
 
-The orthonormal DCT-II of an axis of n nodes has L e_k = (2 - 2 cos(pi k / n)) e_k. It is
-applied as a matrix product along each axis: for grids up to a few hundred nodes an axis
-this beats the fast transform on CPUs and GPUs alike, for any n.
+The orthonormal DCT-II of an axis of n nodes has L e_k = (2 - 2 cos(pi k / n)) e_k. It
+is applied as a matrix product along each axis: for grids up to a few hundred nodes an
+axis this beats the fast transform on CPUs and GPUs alike, for any n.
 """
 
 import equinox as eqx
@@ -29,7 +29,7 @@ class CosineTransform(eqx.Module):
         return CosineTransform(bases, x + y + z)
 
     def solve(self, b: Float[Array, "x y z"], shift=0.0) -> Float[Array, "x y z"]:
-        """(L + shift)^-1 b; for shift 0 the solution of zero mean for b less its mean."""
+        """(L + shift)^-1 b; for shift 0 that of zero mean, for b less its mean."""
         divisor = self.eigenvalues + shift
         regular = divisor > 0
         spectrum = _along_axes(self.bases, b)

@@ -1,10 +1,10 @@
 """Geometric multigrid for A = L + D: the Neumann Laplacian plus a diagonal.
 
-Level l has the operator A_l = 2^l L_l + D_l with D_{l+1} = P^T D_l, the Galerkin scaling
-for the trilinear prolongation P in three dimensions. A V-cycle with one damped-Jacobi
-sweep before and after is a symmetric positive preconditioner; full multigrid, coarse to
-fine, is a start that leaves a few steps to do. The diagonal must be seen on all levels:
-ignoring it there costs three times the steps.
+Level l has the operator A_l = 2^l L_l + D_l with D_{l+1} = P^T D_l, the Galerkin
+scaling for the trilinear prolongation P in three dimensions. A V-cycle with one
+damped-Jacobi sweep before and after is a symmetric positive preconditioner; full
+multigrid, coarse to fine, is a start that leaves a few steps to do. The diagonal must
+be seen on all levels: ignoring it there costs three times the steps.
 """
 
 import equinox as eqx
@@ -50,7 +50,7 @@ class Multigrid(eqx.Module):
         if level + 1 == len(self.diagonals):
             return stage(self.token, self._coarsest, r)
         u, defect = stage(self.token, lambda r: self._first_sweep(r, level), r)
-        coarse = self.v_cycle(defect, level + 1)
+        coarse = self.v_cycle(stage(self.token, restrict, defect), level + 1)
         u = stage(self.token, lambda u, c: u + prolong(c, u.shape), u, coarse)
         return stage(self.token, lambda u, r: self._sweep(u, r, level), u, r)
 
@@ -84,7 +84,7 @@ class Multigrid(eqx.Module):
 
     def _first_sweep(self, r, level):
         u = self._step(level) * r
-        return u, restrict(r - self._apply(u, level))
+        return u, r - self._apply(u, level)
 
     def _sweep(self, u, r, level):
         return u + self._step(level) * (r - self._apply(u, level))

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._stencils import take
+
 Shape = tuple[int, int, int]
 
 
@@ -24,7 +26,7 @@ def prolong(u: Float[Array, "x y z"], shape: Shape) -> Float[Array, "i j k"]:
         fine = np.arange(n)
         near = fine // 2
         far = np.clip(near + np.where(fine % 2 == 0, -1, 1), 0, -(-n // 2) - 1)
-        u = 0.75 * jnp.take(u, near, axis=axis) + 0.25 * jnp.take(u, far, axis=axis)
+        u = 0.75 * take(u, near, axis) + 0.25 * take(u, far, axis)
     return u
 
 
@@ -37,7 +39,7 @@ def restrict(u: Float[Array, "x y z"]) -> Float[Array, "i j k"]:
             source, exists = _source(2 * coarse + offset, n)
             weights = jnp.asarray(weight * exists, u.dtype)
             column = weights.reshape([-1 if a == axis else 1 for a in range(3)])
-            terms.append(column * jnp.take(u, source, axis=axis))
+            terms.append(column * take(u, source, axis))
         u = sum(terms)
     return u
 

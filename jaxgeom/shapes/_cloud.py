@@ -48,10 +48,8 @@ class PointCloud(eqx.Module):
         return self.mask.sum()
 
     def washed(self) -> "PointCloud":
-        """The cloud with zeros in the padding, so that it is finite and has no gradient."""
-        wash = lambda x: jnp.where(
-            _expand(self.mask, x.ndim), x, jnp.zeros((), x.dtype)
-        )
+        """The cloud with zeros in the padding: finite, and without gradient there."""
+        wash = lambda x: jnp.where(_expand(self.mask, x.ndim), x, _zero(x))
         normals = None if self.normals is None else wash(self.normals)
         attributes = {k: wash(v) for k, v in self.attributes.items()}
         return PointCloud(wash(self.points), normals, self.mask, attributes)

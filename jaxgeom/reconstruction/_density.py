@@ -1,0 +1,128 @@
+"""What the points say of the surface before it is known: area, noise, density.
+
+The number of samples per volume, smoothed by a kernel of standard deviation s along
+every axis, is D = (samples per area) / (sqrt(2 pi) s) at a point of a flat surface,
+because the kernel's profile across the surface is a Gaussian at its peak. So the area
+that one sample stands for is a = 1 / (sqrt(2 pi) s D).
+
+The kernel: points are shared among the 8 nodes of a grid of twice the spacing, the
+sums are smoothed by (1, 2, 1) / 4 along each axis, and read back trilinearly. Its
+variance is 1/6 + 1/2 + 1/6 squared coarse spacings, s = 1.826 fine spacings. Where a
+scan is too sparse for that kernel, the estimate of a coarser grid takes over.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..linear import coarse_shape, interpolate, smooth, splat
+
+# Standard deviation of the kernel in spacings of the grid that it lives on.
+_WIDTH = (5 / 6) ** 0.5
+# A kernel is trusted when it holds about this many samples besides the one it is for.
+_ENOUGH = 6.0
+_PRIOR_NOISE = 0.5
+
+
+class SampleGeometry(eqx.Module):
+    """What each sample stands for, in units of grid cells.
+
+    - `area`: [n], the surface area per sample, in squared spacings; 0 for padding.
+    - `noise`: [], the standard deviation of the samples across the surface, spacings.
+    """
+
+    area: Float[Array, " n"]
+    noise: Float[Array, ""]
+
+
+def sample_geometry(
+    q: Float[Array, "n 3"],
+    normals: Float[Array, "n 3"],
+    real: Bool[Array, " n"],
+    shape: tuple[int, int, int],
+    *,
+    levels: int = 1,
+) -> SampleGeometry:
+    """The area and the noise of samples at node indices q of a grid of `shape`.
+
+    **Arguments:**
+
+    - `normals`: [n, 3], unit; `real`: [n], False for padding.
+    - `levels`: how many grids, each twice as coarse, the density is estimated on. The
+      finest that holds enough samples around a point serves it.
+
+    The noise is the scatter of n . (x - m) about its local mean, where m is the mean of
+    the samples in the kernel: a plane gives 0, so does constant curvature.
+    """
+    area = None
+    for level in reversed(range(1, levels + 1)):
+        coarse, grid_shape = at_level(q, shape, level)
+        here = _neighborhood(coarse, real, grid_shape, level)
+        area = here.area if area is None else _blend(here, area)
+    noise = _noise(coarse, normals, real, grid_shape, here)
+    return SampleGeometry(jnp.where(real, area, 0.0), noise)
+
+
+class _Neighborhood(eqx.Module):
+    """The other samples around each sample, by the kernel of one grid level.
+
+    `own` is the weight of the sample itself, `others` the sum over all others, `area`
+    what one sample stands for in fine cells, `trust` in [0, 1] whether the kernel holds
+    enough samples.
+    """
+
+    own: Float[Array, " n"]
+    others: Float[Array, " n"]
+    area: Float[Array, " n"]
+    trust: Float[Array, " n"]
+
+
+def _blend(here, coarser):
+    return here.trust * here.area + (1 - here.trust) * coarser
+
+
+def at_level(q, shape, level):
+    for _ in range(level):
+        q, shape = (q - 0.5) / 2, coarse_shape(shape)
+    return q, shape
+
+
+def _neighborhood(q, real, shape, level) -> _Neighborhood:
+    weights = real.astype(q.dtype)
+    total = interpolate(smooth(splat(weights, q, shape)), q)
+    own = _own_weight(q)
+    # A sample alone still has rounding error for company: at most 1e4 cells of area.
+    smallest = 1e-4 * own
+    others = jnp.maximum(total - own, smallest)
+    coarse_area = 1 / ((2 * jnp.pi) ** 0.5 * _WIDTH * others)
+    num_others = 4 * jnp.pi * _WIDTH**2 / coarse_area
+    trust = jnp.clip(num_others / _ENOUGH, 0.0, 1.0)
+    return _Neighborhood(own, others, coarse_area * 4.0**level, trust)
+
+
+def _own_weight(q):
+    """The kernel of a sample at itself: prod_d (1 - t_d (1 - t_d)) / 2."""
+    t = q - jnp.floor(q)
+    return jnp.prod(0.5 - 0.5 * t * (1 - t), axis=-1)
+
+
+def _noise(q, normals, real, shape, around):
+    """The root mean square of the offsets from the local mean, in fine spacings.
+
+    Means are over the other samples, and samples count as far as they have neighbors.
+    A cloud too sparse to tell gets the prior, as if it were 0.2 % of the samples.
+    """
+    weights = real.astype(q.dtype)
+    center = (jnp.asarray(shape, q.dtype) - 1) / 2
+
+    def mean_of_others(w):
+        total = interpolate(smooth(splat(weights * w, q, shape)), q)
+        return (total - around.own * w) / around.others
+
+    mean = jnp.stack([mean_of_others(q[:, d] - center[d]) for d in range(3)], axis=-1)
+    offset = jnp.sum(normals * (q - center - mean), axis=-1)
+    weights = weights * jnp.maximum(2 * around.trust - 1, 0.0)
+    scatter = (2 * (offset - mean_of_others(offset))) ** 2
+    prior = 0.002 * jnp.sum(real)
+    squares = jnp.sum(weights * jnp.where(weights > 0, scatter, 0.0))
+    return jnp.sqrt((squares + prior * _PRIOR_NOISE**2) / (jnp.sum(weights) + prior))

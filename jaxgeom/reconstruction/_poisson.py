@@ -1,0 +1,305 @@
+"""Poisson and screened Poisson surface reconstruction on a dense grid.
+
+Samples x_p with unit outward normals n_p stand for areas a_p. The indicator u of the
+solid (-1/2 inside, +1/2 outside) minimises
+
+    E(u) = int |grad u - V|^2 + (alpha / h) sum_p a_p u(x_p)^2,
+    V = sum_p a_p n_p K(x - x_p) / h^3,
+
+with K the tensor quadratic B-spline as wide as the grid spacing h. In units of h,
+
+    (L + alpha W^T diag(a) W) u = sum_p a_p n_p . grad K(q_p - i),
+
+L the 7-point Laplacian, W trilinear interpolation at the samples. alpha = 0 is Kazhdan,
+Bolitho, Hoppe (2006); alpha > 0, which pulls the surface to the samples, is Kazhdan and
+Hoppe (2013). Multiplying alpha by 2 when h halves, their rule, is what 1 / h does.
+
+Where a sample stands for more than a cell, its normal is smeared by the kernel of a
+coarser grid, so that sparse parts of a scan close as well as dense ones.
+"""
+
+import math
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._core import (
+    RESULTS,
+    failure_where,
+    first_failure,
+    safe_divide,
+    safe_normalize,
+    stage,
+)
+from ..linear import (
+    LinearSolution,
+    Multigrid,
+    conjugate_gradients,
+    cosine_solve,
+    interpolate,
+    laplacian,
+    prolong,
+    splat,
+    splat_gradient,
+)
+from ..shapes import Grid, PointCloud
+from ._boundary import AbstractBoundary, Neumann
+from ._density import at_level, sample_geometry
+from ._solution import FieldSolution, PoissonStats
+from ._spread import spread
+
+_FEWEST_POINTS = 4
+
+
+class Poisson(eqx.Module):
+    """Plain Poisson reconstruction (2006): smooth, and blind to where exactly the
+    samples lie. With Neumann sides it is one cosine transform, without iteration.
+
+    `levels`: how many coarser grids sparse samples may use (static); None: from the
+    number of samples and the resolution.
+    """
+
+    boundary: AbstractBoundary = Neumann()
+    levels: int | None = eqx.field(static=True, default=None)
+    rtol: float = 1e-2
+    max_steps: int = 50
+
+    def __call__(self, cloud, grid, *, weights=None, token=None) -> FieldSolution:
+        """The field of `cloud` on `grid`; see `poisson`."""
+        return _solve(
+            cloud, grid, self, jnp.zeros((), cloud.points.dtype), weights, token
+        )
+
+
+class ScreenedPoisson(eqx.Module):
+    """Screened Poisson reconstruction (2013): the surface is pulled to the samples.
+
+    `screening`: alpha, from 0.1 (noisy) to 32 (clean and dense), may be an array; None
+    chooses it from the noise of the samples. Other fields as in `screened_poisson`.
+    """
+
+    screening: Float[Array, ""] | float | None = None
+    boundary: AbstractBoundary = Neumann()
+    levels: int | None = eqx.field(static=True, default=None)
+    rtol: float = 1e-2
+    max_steps: int = 50
+
+    def __call__(self, cloud, grid, *, weights=None, token=None) -> FieldSolution:
+        """The field of `cloud` on `grid`; see `screened_poisson`."""
+        alpha = self.screening
+        if alpha is not None:
+            alpha = jnp.asarray(alpha, cloud.points.dtype)
+        return _solve(cloud, grid, self, alpha, weights, token)
+
+
+def poisson(cloud: PointCloud, grid: Grid, *, weights=None, token=None, **settings):
+    """The Poisson field of an oriented cloud: -1/2 inside, +1/2 outside, roughly.
+
+    **Arguments:** as `screened_poisson`, without screening.
+    """
+    return Poisson(**settings)(cloud, grid, weights=weights, token=token)
+
+
+def screened_poisson(
+    cloud: PointCloud,
+    grid: Grid,
+    *,
+    weights: Float[Array, " n"] | None = None,
+    token: Bool[Array, ""] | None = None,
+    **settings,
+) -> FieldSolution:
+    """The screened Poisson field of an oriented cloud.
+
+    **Arguments:**
+
+    - `cloud`: points with outward normals (any length; only directions count).
+    - `grid`: should leave at least two cells around the cloud.
+    - `weights`: [n], confidence of each sample, nonnegative; 1 by default.
+    - `token`: see `jaxgeom._core.stage`; None is right, only slower on CPUs.
+    - `screening`: alpha, dimensionless; None: from the noise of the samples.
+    - `boundary`: `Neumann()`, `Dirichlet()` or `Envelope(outside)`.
+    - `levels`: static, how many coarser grids sparse samples may use; None: from the
+      number of samples and the resolution.
+    - `rtol`, `max_steps`: of the conjugate gradients.
+
+    **Statuses** (`.result`): `too_few_points`, `zero_normals` (samples ignored),
+    `outside_grid` (samples ignored), `not_converged`, `nonfinite_input`.
+
+    Kazhdan and Hoppe (2013), "Screened Poisson surface reconstruction".
+    """
+    method = ScreenedPoisson(**settings)
+    return method(cloud, grid, weights=weights, token=token)
+
+
+class _Samples(eqx.Module):
+    """The usable samples in node indices, with normals in units of the mean spacing."""
+
+    q: Float[Array, "n 3"]
+    normals: Float[Array, "n 3"]
+    real: Bool[Array, " n"]
+    result: RESULTS
+    num_ignored: Array
+
+
+def _solve(cloud, grid, method, screening, weights, token) -> FieldSolution:
+    levels = _levels(method, cloud, grid)
+    samples = _samples(cloud, grid)
+    unit = jnp.prod(grid.spacing) ** (1 / 3)
+    found = stage(
+        token,
+        lambda s: sample_geometry(
+            s.q, s.normals, s.real, grid.shape, levels=levels + 1
+        ),
+        samples,
+    )
+    if screening is None:
+        screening = _screening_for(found.noise)
+    strength = found.area if weights is None else found.area * weights
+    scaled = samples.normals * (unit / grid.spacing)
+    side = stage(
+        token,
+        lambda q, n, a: _divergence(q, n * a[:, None], found.area, grid.shape, levels),
+        samples.q,
+        scaled,
+        strength,
+    )
+    coefficients = (unit / grid.spacing) ** 2
+    # A sample of many cells belongs to a coarser grid, whose 1 / h is weaker.
+    pull = screening * strength / jnp.sqrt(jnp.maximum(found.area, 1.0))
+    solution = _minimise(side, samples.q, pull, coefficients, method, token)
+    at_samples = interpolate(solution.value, samples.q)
+    level = safe_divide(jnp.sum(strength * at_samples), jnp.sum(strength))
+    area = found.area * unit**2
+    inverse = safe_divide(1.0, area)[:, None]
+    density = spread(inverse, samples.q, samples.real, grid.shape, token=token)[..., 0]
+    stats = PoissonStats(
+        solution.residual,
+        solution.steps,
+        screening,
+        found.noise * unit,
+        area,
+        samples.num_ignored,
+    )
+    result = first_failure(samples.result, solution.result)
+    return FieldSolution(grid, solution.value, level, density, result, stats)
+
+
+def _samples(cloud, grid) -> _Samples:
+    """Drop what cannot be used, and say so."""
+    cloud = cloud.washed()
+    finite = jnp.isfinite(cloud.points).all(-1) & jnp.isfinite(cloud.normals).all(-1)
+    points = jnp.where(finite[:, None], cloud.points, 0.0)
+    normals = safe_normalize(jnp.where(finite[:, None], cloud.normals, 0.0))
+    q = grid.index_of(points)
+    within = ((q >= 0.5) & (q <= jnp.asarray(grid.shape) - 1.5)).all(-1)
+    directed = (normals != 0).any(-1)
+    real = cloud.mask & finite & within & directed
+    # Ignored samples go to the middle of the box, with weight 0.
+    middle = (jnp.asarray(grid.shape, q.dtype) - 1) / 2
+    q = jnp.where(real[:, None], q, middle)
+    bad = lambda good: jnp.any(cloud.mask & ~good)
+    result = first_failure(
+        failure_where(jnp.sum(real) < _FEWEST_POINTS, RESULTS.too_few_points),
+        failure_where(bad(finite), RESULTS.nonfinite_input),
+        failure_where(bad(directed | ~finite), RESULTS.zero_normals),
+        failure_where(bad(within), RESULTS.outside_grid),
+    )
+    normals = jnp.where(real[:, None], normals, 0.0)
+    return _Samples(q, normals, real, result, jnp.sum(cloud.mask & ~real))
+
+
+def _levels(method, cloud, grid) -> int:
+    """How many coarser grids the samples need, from their number and the resolution.
+
+    A surface of four middle sections of the grid, shared by n samples of equal area,
+    puts each sample on the level where it fills one cell.
+    """
+    if method.levels is not None:
+        return method.levels
+    cells = 4 * float(np.prod(grid.shape)) ** (2 / 3)
+    per_sample = max(cells / max(cloud.points.shape[0], 1), 1.0)
+    deepest = math.floor(math.log2(min(grid.shape))) - 3
+    return max(min(math.ceil(math.log(per_sample, 4)), deepest), 0)
+
+
+def _divergence(q, vectors, area, shape, levels):
+    """The right side; each sample is smeared on the grid where it fills one cell.
+
+    Prolongation is the refinement rule of the quadratic B-spline, so that the kernel of
+    a coarse grid, prolonged, is the wide kernel on the fine one. In units of the finer
+    grid it is 1/4 as strong per level: 1/16 for area and gradient together with the
+    factor 4 of the coarse grid's own unit of area.
+    """
+    side = None
+    for level in reversed(range(levels + 1)):
+        coarse, level_shape = at_level(q, shape, level)
+        share = _share(area, level, levels)
+        here = splat_gradient(
+            vectors * share[:, None] / 4.0**level, coarse, level_shape
+        )
+        side = here if side is None else here + prolong(side, level_shape) / 4
+    return side
+
+
+def _share(area, level, last):
+    """How much of a sample of this area (in cells) a level gets: a hat in log4."""
+    fitting = jnp.log(jnp.maximum(area, 1.0)) / jnp.log(4.0)
+    fitting = jnp.minimum(fitting, last)
+    return jnp.maximum(1 - jnp.abs(fitting - level), 0.0)
+
+
+def _screening_for(noise):
+    """alpha for samples whose noise is `noise` spacings.
+
+    The pull should not resolve what is noise: alpha falls with the variance. The
+    constant is measured on scans with known noise, see experiments/reconstruction.
+    """
+    return jnp.clip(_NOISE_CONSTANT / jnp.maximum(noise**2, 1e-4), 0.25, 32.0)
+
+
+_NOISE_CONSTANT = 0.1
+
+
+def _minimise(side, q, pull, coefficients, method, token) -> LinearSolution:
+    """Solve (L + W^T pull W) u = side with the fixed nodes at +1/2."""
+    shape = side.shape
+    fixed = method.boundary.fixed(shape)
+    if fixed is None and isinstance(method, Poisson):
+        value = cosine_solve(side, coefficients)
+        zero = jnp.zeros((), value.dtype)
+        return LinearSolution(value, zero, jnp.int32(0), RESULTS.successful)
+
+    def operator(u):
+        smooth = stage(token, lambda u: laplacian(u, coefficients), u)
+        pulled = stage(token, lambda u: splat(pull * interpolate(u, q), q, shape), u)
+        return smooth + pulled
+
+    diagonal = stage(token, lambda p: splat(p, q, shape), pull)
+    if fixed is None:
+        multigrid = Multigrid.of(diagonal, coefficients, token)
+        return _iterate(operator, side, multigrid, lambda u: u, method)
+    free = (~fixed).astype(side.dtype)
+    outside = 0.5 * (1 - free)
+    # Fixed nodes are walls to the preconditioner too, stiffer than any neighbor.
+    stiff = diagonal + (1 - free) * 100 * jnp.max(coefficients)
+    multigrid = Multigrid.of(stiff, coefficients, token)
+    masked = lambda u: free * operator(free * u) + (1 - free) * u
+    rest = free * (side - operator(outside))
+    out = _iterate(masked, rest, multigrid, lambda u: free * u, method)
+    return eqx.tree_at(lambda s: s.value, out, out.value + outside)
+
+
+def _iterate(
+    operator: Callable, side, multigrid: Multigrid, project: Callable, method
+) -> LinearSolution:
+    return conjugate_gradients(
+        operator,
+        side,
+        rtol=method.rtol,
+        max_steps=method.max_steps,
+        preconditioner=lambda r: project(multigrid.v_cycle(project(r))),
+        start=lambda b: project(multigrid.full(b)),
+    )
