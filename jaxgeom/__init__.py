@@ -1,0 +1,52 @@
+"""jaxgeom: from raw scans to watertight meshes, jit-compiled and differentiable.
+
+Rooms and names are loaded when they are first used, so that the command line can answer
+without starting JAX.
+"""
+
+import importlib
+
+__version__ = "0.1.0"
+
+_ROOMS = (
+    "fields",
+    "io",
+    "isosurface",
+    "linear",
+    "meshes",
+    "neighbors",
+    "normals",
+    "pipelines",
+    "reconstruction",
+    "render",
+    "shapes",
+    "transforms",
+)
+_NAMES = {
+    "RESULTS": "_core",
+    "GeometryError": "_core",
+    "runtime_token": "_core",
+    "PointCloud": "shapes",
+    "TriangleMesh": "shapes",
+    "Grid": "shapes",
+    "stack": "shapes",
+    "Rigid": "transforms",
+    "Similarity": "transforms",
+    "Affine": "transforms",
+    "Reconstruction": "pipelines",
+    "reconstruct": "pipelines",
+    "reconstruct_jit": "pipelines",
+}
+__all__ = ["__version__", *_ROOMS, *_NAMES]
+
+
+def __getattr__(name: str):
+    if name in _ROOMS:
+        return importlib.import_module(f".{name}", __name__)
+    if name in _NAMES:
+        return getattr(importlib.import_module(f".{_NAMES[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__():
+    return sorted(__all__)

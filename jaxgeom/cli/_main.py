@@ -1,0 +1,161 @@
+"""Arguments, exit codes and messages; the work is done in the modules beside.
+
+This file imports neither JAX nor trimesh, so that help and usage errors are immediate.
+"""
+
+import argparse
+import importlib
+import os
+import sys
+
+from .. import __version__
+
+OK, INTERNAL, USAGE, FILE, DATA, CHECK, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
+
+_EPILOG = """exit codes: 0 ok, 1 internal error, 2 usage, 3 file, 4 bad data,
+5 the result failed its own check, 130 interrupted"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    arguments = _parser().parse_args(argv)
+    module = importlib.import_module(f"._{arguments.command}", __package__)
+    _use_compile_cache()
+    from .._core import GeometryError
+    from ..io import FileError
+
+    try:
+        return module.run(arguments)
+    except FileError as error:
+        return _complain(error, FILE)
+    except OSError as error:
+        return _complain(error, FILE)
+    except GeometryError as error:
+        return _complain(error, DATA)
+    except KeyboardInterrupt:
+        return _complain("interrupted; no output was replaced", INTERRUPTED)
+    except Exception as error:
+        if arguments.verbose:
+            raise
+        text = f"internal error: {type(error).__name__}: {error}. Run again with -v."
+        return _complain(text, INTERNAL)
+
+
+def _complain(error, code):
+    print(f"jaxgeom: error: {error}", file=sys.stderr)
+    return code
+
+
+def _use_compile_cache():
+    """Keep compiled programs in the user's cache folder between runs."""
+    import jax
+
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    if jax.config.jax_compilation_cache_dir is None:
+        folder = os.path.join(base, "jaxgeom", "compiled")
+        jax.config.update("jax_compilation_cache_dir", folder)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def _parser():
+    parser = argparse.ArgumentParser(
+        prog="jaxgeom",
+        description="From raw scans to watertight meshes.",
+        epilog=_EPILOG,
+    )
+    parser.add_argument(
+        "--version", action="version", version=f"%(prog)s {__version__}"
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_demo(commands)
+    _add_reconstruct(commands)
+    _add_info(commands)
+    _add_pictures(commands)
+    for command in commands.choices.values():
+        command.add_argument(
+            "-v", "--verbose", action="store_true", help="show tracebacks"
+        )
+    return parser
+
+
+def _add_demo(commands):
+    demo = commands.add_parser(
+        "demo", help="make a statue, scan it with noise, reconstruct and check it"
+    )
+    demo.add_argument("--out", default="demo", metavar="DIR", help="folder (demo)")
+    demo.add_argument("--resolution", type=_resolution, default=128, metavar="N")
+    demo.add_argument("--seed", type=int, default=0)
+
+
+def _add_reconstruct(commands):
+    command = commands.add_parser(
+        "reconstruct", help="a watertight mesh from a point cloud"
+    )
+    command.add_argument("input", metavar="SCAN", help="ply, xyz, csv, npz, pcd, ...")
+    command.add_argument("-o", "--output", required=True, metavar="MESH")
+    size = command.add_mutually_exclusive_group()
+    size.add_argument("--resolution", type=_resolution, metavar="N", help="nodes (128)")
+    size.add_argument("--depth", type=_depth, metavar="D", help="resolution 2^D")
+    command.add_argument(
+        "--point-weight",
+        type=_nonnegative,
+        metavar="W",
+        help="screening weight; 0 for plain Poisson (default: from the noise)",
+    )
+    command.add_argument(
+        "--scale",
+        type=_scale,
+        default=1.1,
+        help="side of the cube / longest side (1.1)",
+    )
+    command.add_argument(
+        "--trim",
+        type=_nonnegative,
+        metavar="T",
+        help="cut where samples are sparser than T x the median density",
+    )
+    command.add_argument(
+        "--min-component",
+        type=_nonnegative,
+        default=0.01,
+        metavar="F",
+        help="drop bodies below this share of the largest (0.01; 0 keeps all)",
+    )
+    command.add_argument("--ignore-normals", action="store_true", help="estimate them")
+    command.add_argument("--flip-normals", action="store_true")
+    command.add_argument("--report", metavar="JSON", help="parameters, sizes, statuses")
+
+
+def _add_info(commands):
+    command = commands.add_parser("info", help="what a file holds")
+    command.add_argument("input", metavar="FILE")
+
+
+def _add_pictures(commands):
+    for name, what in (("render", "a picture (PNG)"), ("view", "an HTML page")):
+        command = commands.add_parser(name, help=f"{what} of a mesh or cloud")
+        command.add_argument("input", metavar="FILE")
+        command.add_argument("-o", "--output", required=True)
+        if name == "render":
+            command.add_argument("--size", type=int, default=800, help="pixels (800)")
+            command.add_argument("--azimuth", type=float, default=-60.0)
+            command.add_argument("--elevation", type=float, default=20.0)
+
+
+def _number(kind, low, high, what):
+    def parse(text):
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"must be {what}, given {text!r}")
+        return value
+
+    return parse
+
+
+_resolution = _number(int, 8, 4096, "a whole number from 8 to 4096")
+_depth = _number(int, 3, 12, "a whole number from 3 to 12")
+_nonnegative = _number(float, 0.0, 1e9, "a number of at least 0")
+_scale = _number(float, 1.01, 10.0, "a number from 1.01 to 10")

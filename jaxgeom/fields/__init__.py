@@ -1,0 +1,31 @@
+"""Fields: functions of one point, negative inside a body, and what to do with them."""
+
+from ._camera import Camera as Camera
+from ._field import AbstractField as AbstractField
+from ._field import Complement as Complement
+from ._field import Difference as Difference
+from ._field import Intersection as Intersection
+from ._field import Offset as Offset
+from ._field import Shell as Shell
+from ._field import SmoothUnion as SmoothUnion
+from ._field import Transformed as Transformed
+from ._field import Union as Union
+from ._primitives import Box as Box
+from ._primitives import Capsule as Capsule
+from ._primitives import Cylinder as Cylinder
+from ._primitives import Ellipsoid as Ellipsoid
+from ._primitives import Plane as Plane
+from ._primitives import RoundedBox as RoundedBox
+from ._primitives import Sphere as Sphere
+from ._primitives import Torus as Torus
+from ._queries import SurfacePoint as SurfacePoint
+from ._queries import closest_point as closest_point
+from ._queries import normal as normal
+from ._queries import project as project
+from ._queries import sample as sample
+from ._queries import value as value
+from ._sampled import Sampled as Sampled
+from ._scan import scan as scan
+from ._statue import demo_statue as demo_statue
+from ._trace import Hit as Hit
+from ._trace import sphere_trace as sphere_trace

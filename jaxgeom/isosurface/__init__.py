@@ -1,0 +1,13 @@
+"""From a sampled field to a mesh: one signature, one result for all extractors."""
+
+from ._classify import Counts as Counts
+from ._extract import extract as extract
+from ._extract import pad_outside as pad_outside
+from ._extraction import Capacity as Capacity
+from ._extraction import Extraction as Extraction
+from ._marching_cubes import MarchingCubes as MarchingCubes
+from ._marching_cubes import count as count
+from ._marching_cubes import marching_cubes as marching_cubes
+from ._placement import AbstractPlacement as AbstractPlacement
+from ._placement import Cubic as Cubic
+from ._placement import Linear as Linear

@@ -1,0 +1,131 @@
+"""Emit faces: a face names its vertices by the rank of its three cut edges."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from .._core import prefix_sum, stage
+from ._bits import WORD, Owners, below, expand, expand_filled, popcount, select
+from ._classify import Bits, Numbers
+from ._extraction import Capacity
+from ._tables import CODE_BITS, MAX_TRIANGLES, case_tables
+
+_BIT = WORD.bit_length() - 1
+
+
+class Cells(eqx.Module):
+    """Active cells: the word and the bit of the lower corner, the case, the faces.
+
+    Bit and case share an integer, since the faces read both at once.
+    """
+
+    word: Int[Array, " c"]
+    bit_and_case: Int[Array, " c"]
+    real: Bool[Array, " c"]
+    first_face: Int[Array, " c"]
+    num_faces: Int[Array, ""]
+
+
+class Faces(eqx.Module):
+    """Faces of static capacity, padded with the vertex capacity, and their number."""
+
+    corners: Int[Array, "f 3"]
+    num_faces: Int[Array, ""]
+
+
+def emit_faces(bits: Bits, numbers: Numbers, capacity: Capacity, token) -> Faces:
+    """The faces of the active cells, in the order of the cells."""
+    first, size = numbers.first_cell, capacity.cells
+    owners = expand(numbers.cells, first, size, token)
+    word_and_case = stage(token, _cases, owners, bits)
+    cells = stage(
+        token, lambda c, n: _cells(*c, n, bits, capacity), word_and_case, numbers
+    )
+    slots = expand_filled(cells.first_face, cells.real, capacity.faces, token)
+    codes = stage(token, _codes, slots, cells)
+    corners = [
+        stage(token, lambda *a, i=i: _vertex_number(*a, i), codes, numbers, bits.cut)
+        for i in range(3)
+    ]
+    faces = stage(token, lambda *a: _pack(*a, capacity), corners, cells.num_faces)
+    return Faces(faces, jnp.minimum(cells.num_faces, capacity.faces))
+
+
+def _cases(owners: Owners, bits):
+    words = bits.cells.reshape(-1).at[owners.owner].get(mode="promise_in_bounds")
+    bit = select(words, owners.place)
+    return owners.owner, bit | _case(bits.inside, owners.owner, bit) << _BIT
+
+
+def _case(inside, word, bit):
+    """The 8 corner signs of each cell as a number, corner x + 2y + 4z."""
+    _, ny, per_line = inside.shape
+    flat = inside.reshape(-1)
+    shift = bit.astype(jnp.uint32)
+    crosses = shift == WORD - 1
+    case = jnp.zeros_like(bit)
+    for corner in range(4):
+        here = word + ((corner & 1) * ny + (corner >> 1)) * per_line
+        low = flat.at[here].get(mode="clip") >> shift
+        following = flat.at[here + crosses].get(mode="clip")
+        high = jnp.where(crosses, following, low >> 1)
+        case = case | ((low & 1) << corner | (high & 1) << (corner + 4)).astype(int)
+    return case
+
+
+def _cells(word, bit_and_case, numbers, bits, capacity) -> Cells:
+    real = jnp.arange(capacity.cells) < numbers.needed.cells
+    real = real & (word < _word_limit(numbers, bits, capacity))
+    triangles = jnp.asarray(case_tables()[0])
+    faces = jnp.where(real, triangles[bit_and_case >> _BIT], 0)
+    first = prefix_sum(faces)
+    return Cells(word, bit_and_case, real, first, first[-1] + faces[-1])
+
+
+def _word_limit(numbers, bits, capacity):
+    """The word before which all vertices of all cells fit the capacity.
+
+    Vertices and cells have the same order, so that on overflow the faces that name
+    existing vertices only are a prefix.
+    """
+    _, ny, per_line = bits.inside.shape
+    num_words = numbers.vertices.shape[0]
+    ends = numbers.first_vertex[0] + numbers.vertices
+    fitting = jnp.sum(ends <= capacity.vertices)
+    reach = (ny + 1) * per_line + 1
+    return jnp.where(fitting == num_words, num_words, fitting - reach)
+
+
+class _Codes(eqx.Module):
+    """For every face: the word and the bit of its cell, and its three edge codes."""
+
+    word: Int[Array, " f"]
+    bit: Int[Array, " f"]
+    edges: Int[Array, " f"]
+
+
+def _codes(slots: Owners, cells) -> _Codes:
+    word = cells.word.at[slots.owner].get(mode="promise_in_bounds")
+    both = cells.bit_and_case.at[slots.owner].get(mode="promise_in_bounds")
+    place = jnp.clip(slots.place, 0, MAX_TRIANGLES - 1)
+    table = jnp.asarray(case_tables()[1])
+    edges = table[(both >> _BIT) * MAX_TRIANGLES + place]
+    return _Codes(word, both & (WORD - 1), edges)
+
+
+def _vertex_number(codes, numbers, cut, i):
+    """First vertex of the word and axis + number of cut edges at lower bits."""
+    code = codes.edges >> CODE_BITS * i
+    axis, dx, dy, dz = code & 3, code >> 2 & 1, code >> 3 & 1, code >> 4 & 1
+    _, _, ny, per_line = cut.shape
+    bit = codes.bit + dz
+    word = codes.word + (dx * ny + dy) * per_line + (bit >> _BIT)
+    index = axis * numbers.first_vertex.shape[1] + word
+    first = numbers.first_vertex.reshape(-1).at[index].get(mode="clip")
+    edges = cut.reshape(-1).at[index].get(mode="clip")
+    return first + popcount(edges & below(bit & (WORD - 1)))
+
+
+def _pack(corners, num_faces, capacity):
+    real = jnp.arange(capacity.faces) < num_faces
+    return jnp.where(real[:, None], jnp.stack(corners, axis=-1), capacity.vertices)

@@ -1,0 +1,160 @@
+"""The closest point of a triangle mesh."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from .._core import RESULTS, check_shape, failure_where, safe_divide, safe_norm
+from ..shapes import TriangleMesh
+from ._backends import usable
+from ._blocks import Blocks, pack, search_tile
+from ._knn import build, knn
+from ._morton import bounds, codes, morton_order
+
+_BLOCK = 16
+_TILE = 32
+
+
+class ClosestPoint(eqx.Module):
+    """Where on a mesh each query is nearest.
+
+    `points` [q, 3] = sum of `barycentric` [q, 3] times the corners of `faces` [q];
+    `mask` is False where the mesh has no face at all or the query is not finite (then
+    `faces` is f, `distances` infinite). `result` tells of a mesh without faces.
+    """
+
+    points: Float[Array, "q 3"]
+    distances: Float[Array, " q"]
+    faces: Int[Array, " q"]
+    barycentric: Float[Array, "q 3"]
+    mask: Bool[Array, " q"]
+    result: RESULTS
+
+
+def closest_on_mesh(mesh: TriangleMesh, queries: Float[Array, "q 3"]) -> ClosestPoint:
+    """The exact closest point of the mesh to every query [q, 3].
+
+    Faces are packed along a Morton curve into blocks with bounding boxes; queries, in
+    small tiles, start from the face with the nearest center and visit the blocks that
+    may be nearer. Which face is nearest is a constant under differentiation; given the
+    face, the gradient of the distance is the unit vector from the closest point to the
+    query, shared among the corners by minus the barycentric coordinates (the envelope
+    theorem), and zero on the surface itself.
+
+    Source: C. Ericson, Real-Time Collision Detection, 2005, 5.1.5 (closest point).
+    """
+    check_shape("queries", queries, (None, 3))
+    queries = jnp.asarray(queries, mesh.vertices.dtype)
+    corners = mesh.triangles()
+    face_mask = mesh.face_mask
+    fixed, live = usable(queries, jnp.ones(queries.shape[0], bool))
+    still = jax.lax.stop_gradient(corners)
+    faces = _nearest_faces(still, face_mask, fixed, live)
+    found = faces < corners.shape[0]
+    triangle = corners.at[faces].get(mode="fill", fill_value=0)
+    washed = jnp.where(found[:, None], queries, 0)
+    weights = jax.vmap(_barycentric)(triangle, washed)
+    points = jnp.einsum("qi,qid->qd", weights, triangle)
+    # At the minimum the distance does not depend on the weights to first order.
+    constant = jax.lax.stop_gradient(weights)
+    gap = washed - jnp.einsum("qi,qid->qd", constant, triangle)
+    distances = jnp.where(found, safe_norm(gap), jnp.inf)
+    result = failure_where(~jnp.any(face_mask), RESULTS.no_surface)
+    return ClosestPoint(points, distances, faces, weights, found, result)
+
+
+# Outside jit, loops would compile what they close over as constants (slowly).
+@jax.jit
+def _nearest_faces(corners, mask, queries, live):
+    low, high = jnp.min(corners, axis=1), jnp.max(corners, axis=1)
+    centers = jnp.mean(corners, axis=1)
+    mask = mask & jnp.all(jnp.isfinite(centers), axis=-1)
+    box = bounds(centers, mask)
+    order, _, _ = morton_order(jnp.where(mask[:, None], centers, 0), mask, *box)
+    blocks = pack(order, mask, low, high, _BLOCK)
+    start = knn(build(centers, mask), queries, 1, mask=live).indices[:, 0]
+    ranks = jnp.arange(queries.shape[0], dtype=jnp.int32)
+    span = bounds(queries, live)
+    *_, rows = jax.lax.sort(
+        (*codes(queries, span[0], jnp.max(span[1] - span[0])), ranks), num_keys=2
+    )
+    return _search(blocks, corners, queries, start, rows)
+
+
+def _search(blocks: Blocks, corners, queries, start, rows):
+    """The nearest face of each query, beginning with face `start`, in order `rows`."""
+    f, q = corners.shape[0], queries.shape[0]
+    packed = corners.at[blocks.order].get(mode="fill", fill_value=0)
+    packed = jnp.moveaxis(packed, 1, -1)
+    rows = jnp.pad(rows, (0, -q % _TILE), mode="edge").reshape(-1, _TILE)
+
+    def tile(row):
+        here = queries[row]
+
+        def visit(best, block):
+            squares = _squares(packed[block][..., None, :], here.T[..., None])
+            items = blocks.order[block]
+            squares = jnp.where(items < f, squares, jnp.inf)
+            least = jnp.min(squares, axis=1)
+            item = jnp.min(jnp.where(squares == least[:, None], items, f), axis=1)
+            better = least < best[0]
+            return jnp.where(better, least, best[0]), jnp.where(better, item, best[1])
+
+        first = jnp.moveaxis(
+            corners.at[start[row]].get(mode="fill", fill_value=0), 0, -1
+        )
+        squares = _squares(first, here.T)
+        squares = jnp.where(start[row] < f, squares, -jnp.inf)
+        return search_tile(here, blocks, (squares, start[row]), visit, lambda b: b[0])[
+            1
+        ]
+
+    found = jax.lax.map(tile, rows).reshape(-1)
+    return jnp.zeros(q, jnp.int32).at[rows.reshape(-1)].set(found)
+
+
+def _squares(corners: Float[Array, "3 3 *t"], point: Float[Array, "3 *t"]):
+    """The squared distance of points to triangles, coordinates first."""
+    a, b, c = corners
+    u, v, w = _weights(
+        a, b, c, point, lambda x, y: x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+    )
+    gap = point - (u * a + v * b + w * c)
+    return gap[0] ** 2 + gap[1] ** 2 + gap[2] ** 2
+
+
+def _barycentric(triangle, point):
+    return jnp.stack(_weights(*triangle, point, jnp.dot))
+
+
+def _weights(a, b, c, point, dot):
+    """The barycentric coordinates of the closest point of the triangle a b c."""
+    ab, ac, bc = b - a, c - a, c - b
+    inside_a = 1 - (b_share := _inner_share(ab, ac, point - a, dot))[0] - b_share[1]
+    inner = (inside_a, *b_share)
+    t_ab = jnp.clip(safe_divide(dot(ab, point - a), dot(ab, ab)), 0, 1)
+    t_ac = jnp.clip(safe_divide(dot(ac, point - a), dot(ac, ac)), 0, 1)
+    t_bc = jnp.clip(safe_divide(dot(bc, point - b), dot(bc, bc)), 0, 1)
+    zero = jnp.zeros_like(t_ab)
+    edges = ((1 - t_ab, t_ab, zero), (1 - t_ac, zero, t_ac), (zero, 1 - t_bc, t_bc))
+    gaps = (point - a - t_ab * ab, point - a - t_ac * ac, point - b - t_bc * bc)
+    square_ab, square_ac, square_bc = (dot(g, g) for g in gaps)
+    use_ab = (square_ab <= square_ac) & (square_ab <= square_bc)
+    use_ac = square_ac <= square_bc
+    within = (inner[0] > 0) & (inner[1] > 0) & (inner[2] > 0)
+    pick = lambda i, x, y, z: jnp.where(
+        within, i, jnp.where(use_ab, x, jnp.where(use_ac, y, z))
+    )
+    return tuple(pick(*four) for four in zip(inner, *edges, strict=True))
+
+
+def _inner_share(ab, ac, ap, dot):
+    """The barycentric coordinates of b and c of the foot in the plane; -1 if flat."""
+    bb, bc, cc = dot(ab, ab), dot(ab, ac), dot(ac, ac)
+    pb, pc = dot(ap, ab), dot(ap, ac)
+    area = bb * cc - bc * bc
+    # A sliver has no plane in this precision: its edges hold the closest point.
+    solid = area > 8 * jnp.finfo(area.dtype).eps * bb * cc
+    divide = lambda x: jnp.where(solid, x, -1) / jnp.where(solid, area, 1)
+    return divide(cc * pb - bc * pc), divide(bb * pc - bc * pb)

@@ -1,0 +1,107 @@
+"""Normals from the local plane of the k nearest points."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._core import safe_divide, safe_norm, safe_normalize
+from ..neighbors import CellList, Neighbors, build, knn
+from ..shapes import PointCloud
+
+
+def estimate(cloud: PointCloud, *, k: int = 16) -> PointCloud:
+    """The cloud with unit normals: the direction in which k neighbors spread least.
+
+    n = the eigenvector of the smallest eigenvalue of sum_j (x_j - c)(x_j - c)^T, over
+    the k nearest points (itself included) with mean c. The sign is arbitrary: orient
+    with `orient_toward_viewpoint` or `orient_consistently`. Where the neighbors are
+    fewer than three, or coincide, or lie on a line, the normal is zero. Differentiable
+    in the points; the neighbors are constants, and the gradient is zero where the
+    smallest eigenvalue is not simple.
+
+    Source: Hoppe et al. 1992, Surface reconstruction from unorganized points, 3.1.
+    """
+    normals = local_normals(cloud, nearby(cloud, k))
+    return eqx.tree_at(lambda c: c.normals, cloud, normals, is_leaf=lambda x: x is None)
+
+
+def plane_residual(cloud: PointCloud, *, k: int = 16) -> Float[Array, " n"]:
+    """The rms distance [n] of the k nearest points to their best plane.
+
+    A measure of noise: about sigma sqrt(1 - 3/k) for Gaussian noise sigma, plus the
+    part of the curvature. Zero for padding.
+    """
+    near = nearby(cloud, k)
+    there, centered = _centered(cloud, near)
+    normals = local_normals(cloud, near)
+    height = jnp.where(there, jnp.einsum("nkd,nd->nk", centered, normals), 0)
+    count = jnp.maximum(jnp.sum(there, axis=1), 1).astype(height.dtype)
+    return safe_norm(height) / jnp.sqrt(count)
+
+
+def nearby(cloud: PointCloud, k: int) -> Neighbors:
+    """The k nearest points of every point of a cloud, itself among them."""
+    points = cloud.washed().points
+    index = build(points, cloud.mask, backend=CellList(k))
+    return knn(index, points, k, mask=cloud.mask)
+
+
+def local_normals(cloud: PointCloud, near: Neighbors) -> Float[Array, "n 3"]:
+    """The unit normals [n, 3] of the planes through given neighborhoods."""
+    _, centered = _centered(cloud, near)
+    # Neighborhoods of any size become of order 1, so that squares keep their digits.
+    size = jax.lax.stop_gradient(jnp.max(jnp.abs(centered), axis=(1, 2), keepdims=True))
+    scaled = centered / jnp.where(size > 0, size, 1)
+    spread = jnp.einsum("nki,nkj->nij", scaled, scaled)
+    return smallest_direction(spread)
+
+
+def _centered(cloud, near):
+    there = near.mask
+    points = jnp.asarray(cloud.washed().points)
+    shifted = points[jnp.where(there, near.indices, 0)] - points[:, None]
+    shifted = jnp.where(there[..., None], shifted, 0)
+    count = jnp.maximum(jnp.sum(there, axis=1), 1).astype(shifted.dtype)
+    mean = jnp.sum(shifted, axis=1) / count[:, None]
+    return there, jnp.where(there[..., None], shifted - mean[:, None], 0)
+
+
+@jax.custom_jvp
+def smallest_direction(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:
+    """The unit eigenvector of the smallest eigenvalue; zero where it is not simple.
+
+    dn = sum_i v_i (v_i . dM n) / (l_0 - l_i), and zero for equal eigenvalues, where
+    the derivative of `eigh` is NaN.
+    """
+    return _frame(matrix)[0][..., 0] * _is_plane(matrix)[..., None]
+
+
+@smallest_direction.defjvp
+def _smallest_direction_jvp(primals, tangents):
+    (matrix,), (change,) = primals, tangents
+    vectors, values = _frame(matrix)
+    normal = smallest_direction(matrix)
+    turned = jnp.einsum("...ij,...j->...i", change, normal)
+    gaps = values[..., :1] - values[..., 1:]
+    rounding = 8 * jnp.finfo(values.dtype).eps * values[..., 2:]
+    gaps = jnp.where(-gaps > rounding, gaps, 0)
+    others = vectors[..., 1:]
+    amounts = safe_divide(jnp.einsum("...ji,...j->...i", others, turned), gaps)
+    return normal, jnp.einsum("...ji,...i->...j", others, amounts)
+
+
+def _frame(matrix):
+    values, vectors = jnp.linalg.eigh(matrix)
+    return vectors, values
+
+
+def _is_plane(matrix) -> Bool[Array, "*n"]:
+    """Whether the two largest eigenvalues are positive, beyond rounding."""
+    values = jnp.linalg.eigvalsh(matrix)
+    return values[..., 1] > 32 * jnp.finfo(values.dtype).eps * values[..., 2]
+
+
+def unit(normals: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Normals of length one; zero stays zero."""
+    return safe_normalize(normals)

@@ -1,0 +1,7 @@
+"""The doors: whole pipelines, in a host form and a compiled form."""
+
+from ._memory import memory_needed as memory_needed
+from ._prepare import prepare as prepare
+from ._reconstruct import Reconstruction as Reconstruction
+from ._reconstruct import reconstruct as reconstruct
+from ._reconstruct import reconstruct_jit as reconstruct_jit

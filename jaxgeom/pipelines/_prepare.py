@@ -1,0 +1,178 @@
+"""From whatever the user has to a clean oriented cloud in a unit box (host)."""
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._core import GeometryError, bucket, message
+from ..normals import estimate, orient_consistently
+from ..shapes import PointCloud, stack
+
+_FEWEST = 4
+_FLAT = 1e-6
+_NEIGHBORS = 16
+
+
+class Prepared(eqx.Module):
+    """A cloud in the unit box with the way back: x_user = scale * x + center.
+
+    `center` and `scale` are float64 on the host; `dtype` is that of the user's points;
+    `notes` say in words what was estimated, ignored or looks odd.
+    """
+
+    cloud: PointCloud
+    weights: Float[Array, " n"] | None
+    center: np.ndarray
+    scale: float
+    dtype: np.dtype
+    notes: tuple[str, ...] = eqx.field(static=True)
+
+
+def prepare(cloud, *, weights=None) -> Prepared:
+    """The user's points checked, centered in double precision, and oriented.
+
+    **Arguments:**
+
+    - `cloud`: a `PointCloud` or an array of points [n, 3]. Missing normals are
+      estimated from 16 neighbors and oriented so that they point outward.
+    - `weights`: [n] nonnegative confidence, or None.
+
+    Raises `GeometryError` for fewer than 4 points, points that are not finite, points
+    that all coincide or lie on a line, flat clouds without normals, and normals of
+    which most are zero.
+    """
+    cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(_points_of(cloud))
+    weights = _checked_weights(cloud, weights)
+    keep = np.asarray(cloud.mask)
+    weights = None if weights is None else weights[keep]
+    cloud = cloud.trim()
+    _check_points(cloud.points)
+    points = np.asarray(cloud.points, np.float64)
+    low, high = points.min(axis=0), points.max(axis=0)
+    center, scale = (low + high) / 2, float((high - low).max())
+    notes = _check_extent(points - center, scale, cloud.normals is not None)
+    dtype = jax.dtypes.canonicalize_dtype(cloud.points.dtype)
+    unit = ((points - center) / scale).astype(dtype)
+    oriented = PointCloud(unit, _cast(cloud.normals, dtype), None, cloud.attributes)
+    oriented, more = _with_normals(oriented)
+    notes = notes + more
+    return Prepared(oriented, weights, center, scale, cloud.points.dtype, tuple(notes))
+
+
+def _points_of(points):
+    points = np.asarray(points)
+    if points.dtype == object or points.ndim != 2 or points.shape[1] != 3:
+        raise GeometryError(
+            message(
+                "points must be an array of shape [n, 3]",
+                f"shape {points.shape} and dtype {points.dtype}",
+                "Pass x, y, z in three columns.",
+            )
+        )
+    return points
+
+
+def _checked_weights(cloud, weights):
+    if weights is None:
+        return None
+    weights = np.asarray(weights)
+    if weights.shape != cloud.mask.shape or not (weights >= 0).all():
+        raise GeometryError(
+            message(
+                "weights must be nonnegative, one for each point",
+                f"shape {weights.shape} for {cloud.mask.shape[0]} points",
+                "Pass an array [n] of confidences.",
+            )
+        )
+    return weights
+
+
+def _cast(normals, dtype):
+    return None if normals is None else np.asarray(normals).astype(dtype)
+
+
+def _check_points(points):
+    if points.shape[0] < _FEWEST:
+        raise GeometryError(
+            message(
+                f"a surface needs at least {_FEWEST} points",
+                f"{points.shape[0]}",
+                "Check the file, or the mask of the cloud.",
+            )
+        )
+    bad = ~np.isfinite(points).all(axis=1)
+    if bad.any():
+        raise GeometryError(
+            message(
+                "points must be finite",
+                f"{bad.sum()} of {bad.size} hold NaN or infinity, the first in row "
+                f"{int(np.argmax(bad))}",
+                "Mask them: PointCloud(points, normals, mask).",
+            )
+        )
+
+
+def _check_extent(centered, scale, has_normals):
+    if scale == 0:
+        raise GeometryError(
+            message(
+                "points must not all coincide",
+                f"{len(centered)} equal points",
+                "Check the file: are all coordinates the same?",
+            )
+        )
+    spread = np.linalg.svd(
+        (centered - centered.mean(axis=0)) / scale, compute_uv=False
+    ) / np.sqrt(len(centered))
+    if spread[1] < _FLAT:
+        raise GeometryError(
+            message(
+                "points must not lie on one line",
+                f"width {spread[1] * scale:.2g} at length {spread[0] * scale:.2g}",
+                "A surface needs points in at least two directions.",
+            )
+        )
+    if spread[2] >= _FLAT:
+        return []
+    if not has_normals:
+        raise GeometryError(
+            message(
+                "points without normals must not lie in one plane",
+                f"thickness {spread[2] * scale:.2g} at width {spread[1] * scale:.2g}",
+                "Give normals: they say which side is outside.",
+            )
+        )
+    return ["all points lie in one plane: the surface is a thin sheet; use trim"]
+
+
+def _with_normals(cloud):
+    if cloud.normals is None:
+        padded = jax.tree.map(
+            lambda x: x[0], stack([cloud], capacity=bucket(cloud.points.shape[0]))
+        )
+        oriented = _estimate(padded)
+        return PointCloud(
+            cloud.points,
+            np.asarray(oriented.normals)[: len(cloud.points)],
+            None,
+            cloud.attributes,
+        ), ["normals were estimated and oriented outward"]
+    length = np.linalg.norm(np.nan_to_num(cloud.normals), axis=1)
+    bad = (length == 0) | ~np.isfinite(cloud.normals).all(axis=1)
+    if bad.mean() > 0.5:
+        raise GeometryError(
+            message(
+                "most normals must be finite and not zero",
+                f"{bad.sum()} of {bad.size} are not",
+                "Leave the normals out: they are estimated then.",
+            )
+        )
+    if not bad.any():
+        return cloud, []
+    return cloud, [f"{bad.sum()} of {bad.size} points have no usable normal: ignored"]
+
+
+@eqx.filter_jit
+def _estimate(cloud):
+    return orient_consistently(estimate(cloud, k=_NEIGHBORS))

@@ -1,0 +1,140 @@
+"""Exact neighbors on easy and nasty data, against scipy; gradients, masks, vmap."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from jaxgeom._core import RESULTS, GeometryError
+from jaxgeom.neighbors import BruteForce, CellList, build, knn
+
+N, Q = 1200, 300
+
+
+def _clouds():
+    rng = np.random.default_rng(7)
+    sphere = rng.normal(size=(N, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    clusters = np.concatenate(
+        [
+            rng.normal(0, 1e-3, (N // 3, 3)),
+            rng.normal(0, 1, (N // 3, 3)) + 900,
+            rng.normal(0, 1e-2, (N // 3, 3)) + 5,
+        ]
+    )
+    plane = rng.uniform(-1, 1, (N, 3)) * [3, 2, 0]
+    line = rng.uniform(-1, 1, (N, 3)) * [0, 2, 0]
+    return {
+        "surface": (2.3 * sphere + [4, -1, 9], 2.1 * sphere[:Q] + [4, -1, 9.1]),
+        "volume": (rng.uniform(-2, 5, (N, 3)), rng.uniform(-3, 6, (Q, 3))),
+        "clusters": (clusters, clusters[::4] + 1e-4),
+        "plane": (plane, rng.uniform(-1, 1, (Q, 3))),
+        "line": (line, rng.uniform(-1, 1, (Q, 3))),
+        "duplicates": (np.repeat(sphere[:10], N // 10, axis=0), sphere[:Q]),
+        "one place": (np.full((N, 3), 2.5), sphere[:Q]),
+        "far queries": (sphere, 1e4 * sphere[:Q] + 3e4),
+    }
+
+
+CLOUDS = _clouds()
+
+
+def _assert_exact(points, queries, k, out):
+    points, queries = (np.asarray(x, np.float32) for x in (points, queries))
+    want = cKDTree(points.astype(float)).query(queries.astype(float), k)[0]
+    np.testing.assert_allclose(
+        np.asarray(out.distances), want.reshape(-1, k), rtol=2e-6, atol=1e-7
+    )
+    there = points[np.asarray(out.indices)] - queries[:, None]
+    np.testing.assert_allclose(np.linalg.norm(there, axis=-1), out.distances, rtol=2e-6)
+    assert np.asarray(out.mask).all()
+    rows = np.sort(np.asarray(out.indices), axis=1)
+    assert k == 1 or (np.diff(rows, axis=1) > 0).all()
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+@pytest.mark.parametrize("backend", [CellList(4), BruteForce(tile=64)])
+def test_equals_a_tree(name, backend):
+    points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS[name])
+    find = jax.jit(lambda p, q: knn(build(p, backend=backend), q, 5))
+    _assert_exact(points, queries, 5, find(points, queries))
+
+
+@pytest.mark.parametrize("k", [1, 64])
+def test_other_counts_of_neighbors(k):
+    points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS["surface"])
+    _assert_exact(
+        points, queries, k, jax.jit(lambda p, q: knn(build(p), q, k))(points, queries)
+    )
+
+
+@pytest.mark.parametrize("backend", [CellList(3), BruteForce()])
+def test_padding_and_missing_neighbors(backend):
+    points, queries = CLOUDS["volume"]
+    points, queries = jnp.asarray(points[:40]), jnp.asarray(queries[:9])
+    mask = jnp.arange(40) < 3
+    points = jnp.where(mask[:, None], points, jnp.nan)
+    asked = jnp.arange(9) != 4
+    out = knn(build(points, mask, backend=backend), queries, 5, mask=asked)
+    assert (out.mask == asked[:, None] & (jnp.arange(5) < 3)).all()
+    assert ((out.indices == 40) == ~out.mask).all()
+    assert (jnp.isinf(out.distances) == ~out.mask).all()
+    assert bool(out.result == RESULTS.too_few_points)
+
+
+@pytest.mark.parametrize("backend", [CellList(6), BruteForce()])
+def test_max_distance_is_a_gate(backend):
+    points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS["volume"])
+    gate = 0.8
+    free = knn(build(points, backend=backend), queries, 6)
+    gated = knn(build(points, backend=backend), queries, 6, max_distance=gate)
+    inside = free.distances <= gate
+    assert 0.1 < inside.mean() < 0.9
+    assert (gated.mask == inside).all()
+    assert (gated.distances == jnp.where(inside, free.distances, jnp.inf)).all()
+
+
+@pytest.mark.parametrize("backend", [CellList(), BruteForce()])
+def test_vmap_is_a_loop(backend):
+    names = ["surface", "volume", "plane"]
+    points = jnp.asarray(np.stack([CLOUDS[n][0][:500] for n in names]), jnp.float32)
+    queries = jnp.asarray(np.stack([CLOUDS[n][1][:70] for n in names]), jnp.float32)
+    find = lambda p, q: knn(build(p, backend=backend), q, 3).distances
+    batch = jax.jit(jax.vmap(find))(points, queries)
+    alone = jnp.stack([find(p, q) for p, q in zip(points, queries, strict=True)])
+    np.testing.assert_allclose(batch, alone, rtol=1e-6)
+
+
+def test_gradients(x64):
+    points, queries = (jnp.asarray(x[:60]) for x in CLOUDS["volume"])
+    queries = queries[:20]
+    loss = lambda p, q: jnp.sum(jnp.sin(knn(build(p), q, 3).distances))
+    slopes = jax.jit(jax.grad(loss, argnums=(0, 1)))(points, queries)
+    ways = jax.random.normal(jax.random.key(3), (80, 3))
+    step = lambda h: loss(points + h * ways[:60], queries + h * ways[60:])
+    numeric = (step(1e-6) - step(-1e-6)) / 2e-6
+    given = jnp.sum(slopes[0] * ways[:60]) + jnp.sum(slopes[1] * ways[60:])
+    np.testing.assert_allclose(given, numeric, rtol=1e-6)
+    zero = jax.grad(loss, argnums=1)(points, points[:20])
+    assert jnp.isfinite(zero).all()
+
+
+def test_padding_has_no_gradient():
+    points = jnp.asarray(CLOUDS["volume"][0][:30], jnp.float32)
+    mask = jnp.arange(30) % 3 > 0
+    loss = lambda p: jnp.where(
+        (o := knn(build(p, mask), p, 25)).mask, o.distances, 0
+    ).sum()
+    slope = jax.grad(loss)(points)
+    assert jnp.isfinite(slope).all()
+
+
+def test_wrong_input_is_explained():
+    points = jnp.zeros((5, 3))
+    with pytest.raises(GeometryError, match="k must be at least 1"):
+        knn(build(points), points, 0)
+    with pytest.raises(GeometryError, match="queries must have shape"):
+        knn(build(points), points[0], 1)
+    with pytest.raises(GeometryError, match="room for at least one"):
+        build(jnp.zeros((0, 3)))
