@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key
 
+from .._core import safe_norm
 from ..shapes import PointCloud
 from ._camera import Camera
 from ._trace import sphere_trace
@@ -29,25 +30,23 @@ def scan(
     A ray ends at twice the distance from camera to target.
     """
     keys = jax.random.split(key, len(cameras))
-    # One program for all cameras: a loop in Python would compile one for each.
-    together = jax.tree.map(lambda *parts: jnp.stack(parts), *cameras)
-    view = lambda item: _view(field, item[0], rays, noise, item[1])
-    views = jax.lax.map(view, (together, keys))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+    view = lambda one: _view(field, one[0], rays, noise, one[1])
+    views = jax.lax.map(view, (stacked, keys))
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), views)
 
 
 def _view(field, camera, rays, noise, key):
     directions = camera.directions((rays, rays)).reshape(-1, 3)
-    far = 2 * jnp.linalg.norm(camera.target - camera.position)
+    far = 2 * safe_norm(camera.target - camera.position)
     trace = lambda d: sphere_trace(field, camera.position, d, max_distance=far)
-    hits = jax.lax.map(trace, directions, batch_size=min(4096, rays * rays))
+    hits = jax.vmap(trace)(directions)
     error = noise * jax.random.normal(key, hits.distance.shape, directions.dtype)
     away = jnp.sum(hits.normal * directions, axis=-1, keepdims=True) > 0
-    viewpoint = jnp.broadcast_to(camera.position, directions.shape)
     cloud = PointCloud(
         hits.point + error[:, None] * directions,
         jnp.where(away, -hits.normal, hits.normal),
         hits.hit,
-        {"viewpoint": viewpoint},
+        {"viewpoint": jnp.broadcast_to(camera.position, directions.shape)},
     )
     return cloud.washed()

@@ -25,7 +25,7 @@ def _pedestal():
 
 
 def _robe():
-    skirt = Ellipsoid((0.29, 0.25, 0.52), (0, 0, -0.50))
+    skirt = Ellipsoid((0.28, 0.24, 0.48), (0, 0, -0.44))
     torso = Ellipsoid((0.165, 0.13, 0.27), (0, 0, 0.13))
     shoulders = Capsule((-0.17, 0, 0.27), (0.17, 0, 0.27), 0.07)
     return skirt.blend(torso, 0.12).blend(shoulders, 0.15)

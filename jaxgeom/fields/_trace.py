@@ -56,8 +56,7 @@ def sphere_trace(
     ray = jax.lax.stop_gradient((origin, direction))
     t, f, steps = _march(frozen(field), ray, near, far, max_steps)
     hit = (f <= near) & (t <= far)
-    t = jnp.minimum(t, far)
-    t = jnp.where(hit, t + _sensitivity(field, origin, direction, t, hit), t)
+    t = jnp.where(hit, t + _sensitivity(field, origin, direction, t, hit), far)
     point = origin + t * direction
     unit = jnp.where(hit, normal(field, point), 0)
     return Hit(point, t, unit, hit, steps)
@@ -72,18 +71,17 @@ def _march(field, ray, near, far, max_steps):
 
     def advance(state):
         t, f, steps = state
-        t = t + f
+        t = jnp.where(steps == 0, t, t + f)
         return t, field(origin + t * direction), steps + 1
 
-    start = jnp.zeros((), direction.dtype)
-    return jax.lax.while_loop(going, advance, (start, field(origin), jnp.int32(1)))
+    zero = jnp.zeros((), direction.dtype)
+    return jax.lax.while_loop(going, advance, (zero, zero + jnp.inf, jnp.int32(0)))
 
 
 def _sensitivity(field, origin, direction, t, hit):
     """Zero, with the derivative of the hit distance (implicit function theorem)."""
-    f = field(origin + t * direction)
-    at = jax.lax.stop_gradient(origin + t * direction)
-    slope = jnp.dot(jax.grad(frozen(field))(at), jax.lax.stop_gradient(direction))
+    f, gradient = jax.value_and_grad(field)(origin + t * direction)
+    slope = jax.lax.stop_gradient(jnp.dot(gradient, direction))
     # A ray that leaves or grazes the surface has no such derivative.
     entering = hit & (slope < -(jnp.finfo(t.dtype).eps ** 0.5))
     change = f - jax.lax.stop_gradient(f)

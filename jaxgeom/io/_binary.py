@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from ._columns import COLOR, NORMAL, Contents
+from ._columns import COLOR, NORMAL, POSITION, Contents
+from ._text import text_rows
 
 _PLY_NAMES = {
     "i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort",
@@ -34,7 +35,14 @@ def write_ply(contents: Contents) -> bytes:
 
 
 def write_pcd(columns: dict[str, np.ndarray]) -> bytes:
-    """A binary PCD file (version 0.7), with colors packed as PCL does."""
+    """A PCD file (version 0.7), with colors packed as PCL does.
+
+    Binary for float32 positions and normals; text with all digits for float64, because
+    PCL refuses binary doubles and Open3D reads them as zeros.
+    """
+    text = any(
+        columns[k].dtype == np.float64 for k in (*POSITION, *NORMAL) if k in columns
+    )
     columns = {_word(k): v for k, v in columns.items()}
     if all(k in columns for k in COLOR):
         red, green, blue = (columns.pop(k).astype(np.uint32) for k in COLOR)
@@ -43,20 +51,23 @@ def write_pcd(columns: dict[str, np.ndarray]) -> bytes:
     columns = {renamed.get(k, k): v for k, v in columns.items()}
     rows = _packed(columns)
     kinds = {"f": "F", "i": "I", "u": "U"}
+    sizes = [
+        4 if text and v.dtype.kind == "f" else v.itemsize for v in columns.values()
+    ]
     header = [
         "# .PCD v0.7 - Point Cloud Data file format",
         "VERSION 0.7",
         f"FIELDS {' '.join(columns)}",
-        f"SIZE {' '.join(str(v.dtype.itemsize) for v in columns.values())}",
+        f"SIZE {' '.join(map(str, sizes))}",
         f"TYPE {' '.join(kinds[v.dtype.kind] for v in columns.values())}",
         f"COUNT {' '.join('1' for _ in columns)}",
         f"WIDTH {len(rows)}",
         "HEIGHT 1",
         "VIEWPOINT 0 0 0 1 0 0 0",
         f"POINTS {len(rows)}",
-        "DATA binary",
+        "DATA ascii" if text else "DATA binary",
     ]
-    return _encoded(header) + rows.tobytes()
+    return _encoded(header) + (text_rows(rows, " ") if text else rows.tobytes())
 
 
 def _packed(columns):

@@ -25,7 +25,8 @@ def save_cloud(path: str | os.PathLike[str], cloud: PointCloud) -> None:
       further `.gz` compresses.
     - `cloud`: one cloud, not a batch.
 
-    PLY and PCD are binary; float64 data are written as doubles, float32 as floats.
+    PLY is binary: float64 data are written as doubles, float32 as floats. PCD is binary
+    for float32 and text for float64, since other programs do not read binary doubles.
     Colors become bytes. Attributes [n, k] become the columns `name_0`, `name_1`, ...;
     NPZ alone keeps their shapes. The file appears complete or not at all. Raises
     `FileError` for an unknown extension or a path that cannot be written,

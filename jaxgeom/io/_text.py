@@ -83,14 +83,20 @@ def write_text(columns: dict[str, np.ndarray], form: str) -> bytes:
     if form != "csv":
         plain = set(columns) <= {*POSITION, *NORMAL}
         header = "" if plain else f"# {header}"
-    formats = [_digits(column.dtype) for column in columns.values()]
     rows = np.empty(
         len(columns["x"]), [(f"f{i}", v.dtype) for i, v in enumerate(columns.values())]
     )
     for i, column in enumerate(columns.values()):
         rows[f"f{i}"] = column
+    head = f"{header}\n" if header else ""
+    return head.encode() + text_rows(rows, delimiter)
+
+
+def text_rows(rows: np.ndarray, delimiter: str) -> bytes:
+    """A structured array as lines of text, with as many digits as the numbers have."""
+    formats = [_digits(rows.dtype[i]) for i in range(len(rows.dtype))]
     out = io.StringIO()
-    np.savetxt(out, rows, fmt=formats, delimiter=delimiter, header=header, comments="")
+    np.savetxt(out, rows, fmt=formats, delimiter=delimiter)
     return out.getvalue().encode()
 
 

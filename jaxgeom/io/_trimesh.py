@@ -44,12 +44,14 @@ def from_trimesh(geometry) -> TriangleMesh | PointCloud:
     """The mesh of a `trimesh.Trimesh` or `Scene`, the cloud of a `trimesh.PointCloud`.
 
     Positions keep their precision; nothing is merged. Normals are taken where the
-    trimesh object holds them already. Raises `GeometryError` for other objects.
+    trimesh object holds them already. The meshes of a scene are placed and joined, with
+    what all of them carry. Raises `GeometryError` for other objects, or a scene without
+    a mesh.
     """
     import trimesh
 
     if isinstance(geometry, trimesh.Scene):
-        geometry = geometry.to_mesh()
+        return _scene_mesh(geometry)
     if isinstance(geometry, trimesh.PointCloud):
         colors = np.asarray(geometry.colors)
         attributes = {"colors": unit_colors(colors[:, :3])} if colors.size else {}
@@ -75,6 +77,52 @@ def from_trimesh(geometry) -> TriangleMesh | PointCloud:
     return TriangleMesh(np.array(geometry.vertices), faces, normals, attributes)
 
 
+def _scene_mesh(scene):
+    """One mesh of a scene; `trimesh.Scene.to_mesh` would lose the normals."""
+    import trimesh
+
+    nodes = [scene.graph[node] for node in scene.graph.nodes_geometry]
+    placed = [(placement, scene.geometry[key]) for placement, key in nodes]
+    parts = [
+        _placed(from_trimesh(shape), np.asarray(placement))
+        for placement, shape in placed
+        if isinstance(shape, trimesh.Trimesh)
+    ]
+    if not parts:
+        raise GeometryError(
+            message(
+                "a scene must hold at least one mesh",
+                f"{len(placed)} other objects",
+                "Export the mesh itself.",
+            )
+        )
+    counts = np.array([len(part.vertices) for part in parts])
+    starts = np.cumsum(counts) - counts
+    join = lambda arrays: np.concatenate(list(arrays))
+    oriented = all(part.normals is not None for part in parts)
+    shared = set.intersection(*(set(part.attributes) for part in parts))
+    return TriangleMesh(
+        join(part.vertices for part in parts),
+        join(p.faces + start for p, start in zip(parts, starts, strict=True)),
+        join(part.normals for part in parts) if oriented else None,
+        {k: join(part.attributes[k] for part in parts) for k in sorted(shared)},
+    )
+
+
+def _placed(mesh, placement):
+    linear, offset = placement[:3, :3], placement[:3, 3]
+    vertices, faces, normals = mesh.vertices @ linear.T + offset, mesh.faces, None
+    mirrored = np.linalg.det(linear) < 0
+    if mesh.normals is not None:
+        # Normals turn with the inverse transpose, which does not keep their length.
+        turned = mesh.normals @ np.linalg.inv(linear)
+        length = np.linalg.norm(turned, axis=1, keepdims=True)
+        zero = np.zeros_like(turned)
+        normals = np.divide(turned, length, out=zero, where=length > 0)
+    faces = faces[:, ::-1] if mirrored else faces
+    return TriangleMesh(vertices, faces, normals, mesh.attributes)
+
+
 def read_glb(data: bytes, name: str) -> Contents:
     """The meshes of a binary glTF file as one, through trimesh."""
     import trimesh
@@ -84,7 +132,7 @@ def read_glb(data: bytes, name: str) -> Contents:
         raise cut_short(name, "GLB", "bytes", max(length, 12), len(data))
     # trimesh has no common error: whatever it raises means that it cannot read this.
     try:
-        loaded = trimesh.load_mesh(io.BytesIO(data), file_type="glb", process=False)
+        loaded = trimesh.load_scene(io.BytesIO(data), file_type="glb", process=False)
         mesh = from_trimesh(loaded)
     except Exception as error:
         raise damaged(name, "GLB", str(error) or type(error).__name__) from error

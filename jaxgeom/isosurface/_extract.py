@@ -42,6 +42,8 @@ def extract(
     """
     token = runtime_token()
     values = _sample(field, grid) if callable(field) else jnp.asarray(field)
+    # A Python number would be a constant of the program: one compilation per level.
+    level = jnp.asarray(level, jnp.result_type(values.dtype, float))
     if closed:
         values, grid = _pad(values, grid, level)
     needed = jax.device_get(_measure(method, values, level, token))

@@ -6,8 +6,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._core import GeometryError, message, safe_divide, safe_normalize
-from ..neighbors import build, closest_on_mesh, knn
+from ..neighbors import BruteForce, build, closest_on_mesh, knn
 from ..shapes import PointCloud, TriangleMesh
+
+_FEW = 1024
 
 
 class Match(eqx.Module):
@@ -118,7 +120,10 @@ def hausdorff(a: PointCloud | Array, b: PointCloud | Array) -> Float[Array, ""]:
 def match(a: PointCloud | Array, b: PointCloud | Array) -> Match:
     """For every point of a, the nearest point of b."""
     a, b = _as_cloud(a), _as_cloud(b)
-    near = knn(build(b.points, b.mask), a.points, 1, mask=a.mask)
+    # A few points are sooner compared than sorted (and the program is much smaller).
+    backend = BruteForce() if b.points.shape[0] <= _FEW else None
+    index = build(b.points, b.mask, backend=backend)
+    near = knn(index, a.points, 1, mask=a.mask)
     cosines = None
     if a.normals is not None and b.normals is not None:
         there = b.normals.at[near.indices[:, 0]].get(mode="fill", fill_value=0)

@@ -63,6 +63,7 @@ class CellList(AbstractBackend):
 
     neighbors: int = eqx.field(static=True, default=1)
 
+    @eqx.filter_jit
     def build(self, points, mask):
         given, real = points, mask
         points, mask = usable(points, mask)

@@ -190,8 +190,39 @@ def test_to_and_from_trimesh():
     assert from_trimesh(to_trimesh(cloud)).points.shape == (5, 3)
     scene = trimesh.Scene([peer, trimesh.creation.box()])
     assert from_trimesh(scene).faces.shape[0] == len(peer.faces) + 12
+    with pytest.raises(GeometryError, match="at least one mesh"):
+        from_trimesh(trimesh.Scene())
     with pytest.raises(GeometryError, match="given: a str"):
         from_trimesh("mesh")
+
+
+@pytest.mark.parametrize("scale", [(2, 3, 0.5), (-2, 3, 0.5)])
+def test_scenes_are_placed(tmp_path, scale):
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    unit = np.array(ball.vertices)
+    ball = trimesh.Trimesh(unit, ball.faces, vertex_normals=unit, process=False)
+    turn = trimesh.transformations.rotation_matrix(0.4, [3, 1, 2])
+    turn[:3, :3] = turn[:3, :3] @ np.diag(scale)
+    turn[:3, 3] = [5.0, 0.2, 0.3]
+    scene = trimesh.Scene()
+    scene.add_geometry(ball, transform=turn)
+    scene.export(tmp_path / "a.glb")
+    mesh = load_mesh(tmp_path / "a.glb")
+    # The ellipsoid is where |A^-1 (y - t)| = 1; its normal is the gradient of that.
+    inverse = np.linalg.inv(turn[:3, :3])
+    local = (mesh.vertices - turn[:3, 3]) @ inverse.T
+    np.testing.assert_allclose(np.linalg.norm(local, axis=1), 1, atol=1e-5)
+    gradient = local @ inverse
+    gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
+    np.testing.assert_allclose(mesh.normals, gradient, atol=1e-5)
+    assert to_trimesh(mesh).volume > 0
+    scene.add_geometry(trimesh.creation.box(extents=[1, 2, 3]))
+    scene.export(tmp_path / "b.glb")
+    joined = load_mesh(tmp_path / "b.glb")
+    assert joined.normals is None
+    np.testing.assert_allclose(
+        to_trimesh(joined).volume, to_trimesh(mesh).volume + 6, rtol=1e-5
+    )
 
 
 def test_import_leaves_trimesh_alone():

@@ -56,13 +56,12 @@ def test_stanford_scans(data, name):
 
 
 def test_stanford_reconstruction(data):
-    mesh = load_mesh(
-        data / "registration" / "stanford_bunny" / "bun_zipper_res2.ply.gz"
-    )
+    folder = data / "registration" / "stanford_bunny"
+    mesh = load_mesh(folder / "bun_zipper_res2.ply.gz")
     assert mesh.vertices.shape == (8171, 3) and mesh.faces.shape == (16301, 3)
     assert set(mesh.attributes) == {"confidence", "intensity"}
     with pytest.raises(FileError, match="bun000_xyz"):
-        load_cloud(data / "registration" / "stanford_bunny" / "bunny_scans.npz")
+        load_cloud(folder / "bunny_scans.npz")
 
 
 def test_small_gicp(data):

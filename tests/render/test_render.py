@@ -32,7 +32,7 @@ def torus_mesh(sections=96):
 
 def is_red(image):
     image = image.astype(int)
-    return image[..., 0] > image[..., 2] + 30
+    return image[..., 0] > image[..., 2]
 
 
 def test_field_and_mesh_of_one_body_give_one_picture():
