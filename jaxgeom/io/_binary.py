@@ -13,7 +13,7 @@ _PLY_NAMES = {
 
 def write_ply(contents: Contents) -> bytes:
     """A binary little-endian PLY file; float64 columns are `property double`."""
-    columns = {_word(k): _ply_typed(v) for k, v in contents.columns.items()}
+    columns = {k: _ply_typed(v) for k, v in contents.columns.items()}
     rows = _packed(columns)
     header = [
         "ply",
@@ -37,13 +37,12 @@ def write_ply(contents: Contents) -> bytes:
 def write_pcd(columns: dict[str, np.ndarray]) -> bytes:
     """A PCD file (version 0.7), with colors packed as PCL does.
 
-    Binary for float32 positions and normals; text with all digits for float64, because
-    PCL refuses binary doubles and Open3D reads them as zeros.
+    Binary for float32 positions and normals; text with all digits for float64, since
+    Open3D 0.20 reads binary doubles as zeros.
     """
     text = any(
         columns[k].dtype == np.float64 for k in (*POSITION, *NORMAL) if k in columns
     )
-    columns = {_word(k): v for k, v in columns.items()}
     if all(k in columns for k in COLOR):
         red, green, blue = (columns.pop(k).astype(np.uint32) for k in COLOR)
         columns["rgb"] = (red << 16) | (green << 8) | blue
@@ -85,10 +84,6 @@ def _ply_typed(column):
     limits = np.iinfo(np.int32)
     fits = column.min() >= limits.min and column.max() <= limits.max
     return column.astype(np.int32 if fits else np.float64)
-
-
-def _word(name):
-    return "_".join(name.split()) or "unnamed"
 
 
 def _encoded(lines):

@@ -1,5 +1,6 @@
 """Named columns, the common form of all files, to and from the nouns."""
 
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,8 @@ _SPELLINGS = (
     ("rf", "gf", "bf"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
 )
+# What PCD calls normals, packed colors and padding.
+_PCD_NAMES = {"normal_x", "normal_y", "normal_z", "rgb", "rgba", "_"}
 _MEANING = (POSITION, NORMAL, COLOR, NORMAL, NORMAL, NORMAL, COLOR, COLOR, COLOR)
 
 
@@ -172,17 +175,23 @@ def _join(points, normals, attributes):
             if is_color
             else spread(name, _storable(name, value))
         )
-        clash = sorted(set(new) & set(columns))
+        new = {_word(k): v for k, v in new.items()}
+        clash = sorted(set(new) & (set(columns) | _PCD_NAMES))
         if clash:
             raise GeometryError(
                 message(
                     "an attribute must not have the name of another column",
-                    f"attribute {name!r} gives the column {clash[0]!r} twice",
+                    f"attribute {name!r}, which gives the column {clash[0]!r}",
                     "Rename the attribute.",
                 )
             )
         columns |= new
     return columns
+
+
+def _word(name):
+    """A name that is one word in every format."""
+    return re.sub(r"[\s,;]+", "_", name) or "unnamed"
 
 
 def _floating(x):

@@ -12,6 +12,7 @@ from ._tables import not_numbers, parse_table
 
 _DATA = re.compile(rb"(?:^|\n)DATA[ \t]+(\w+)[ \t]*\r?(?:\n|\Z)")
 _KINDS = {"F": "f", "I": "i", "U": "u"}
+_WIDEST = 2**20
 _PACKED = ("rgb", "rgba")
 
 
@@ -63,9 +64,10 @@ def _fields(entries):
     names = entries["FIELDS"] if "FIELDS" in entries else entries["COLUMNS"]
     counts = entries.get("COUNT", ["1"] * len(names))
     kinds = zip(entries["TYPE"], entries["SIZE"], strict=True)
-    dtypes = [np.dtype(_KINDS[kind] + size) for kind, size in kinds]
+    dtypes = [np.dtype(f"{_KINDS[kind]}{int(size)}") for kind, size in kinds]
     fields = list(zip(names, dtypes, (int(c) for c in counts), strict=True))
-    if any(count < 0 or count > 2**20 for _, _, count in fields):
+    sizes = [count for _, _, count in fields]
+    if min(sizes, default=0) < 0 or sum(sizes) > _WIDEST:
         raise ValueError(f"COUNT {' '.join(counts)}")
     named = [n for n in names if n != "_"]
     if len(set(named)) < len(named):

@@ -26,7 +26,7 @@ def save_cloud(path: str | os.PathLike[str], cloud: PointCloud) -> None:
     - `cloud`: one cloud, not a batch.
 
     PLY is binary: float64 data are written as doubles, float32 as floats. PCD is binary
-    for float32 and text for float64, since other programs do not read binary doubles.
+    for float32 and text for float64, since some programs misread binary doubles.
     Colors become bytes. Attributes [n, k] become the columns `name_0`, `name_1`, ...;
     NPZ alone keeps their shapes. The file appears complete or not at all. Raises
     `FileError` for an unknown extension or a path that cannot be written,

@@ -1,7 +1,6 @@
 """Text files of one point per line."""
 
 import io
-import re
 
 import numpy as np
 
@@ -78,7 +77,6 @@ def write_text(columns: dict[str, np.ndarray], form: str) -> bytes:
     there are others than positions and normals.
     """
     delimiter = "," if form == "csv" else " "
-    columns = {re.sub(r"[\s,;]+", "_", k): v for k, v in columns.items()}
     header = delimiter.join(columns)
     if form != "csv":
         plain = set(columns) <= {*POSITION, *NORMAL}

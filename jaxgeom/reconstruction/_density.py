@@ -82,6 +82,7 @@ def _blend(here, coarser):
 
 
 def at_level(q, shape, level):
+    """Node indices and shape on the grid that is `level` times twice as coarse."""
     for _ in range(level):
         q, shape = (q - 0.5) / 2, coarse_shape(shape)
     return q, shape

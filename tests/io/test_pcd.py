@@ -144,6 +144,8 @@ def test_lzf(size, values):
         (b"DATA binary", b"NOTHING"),
         (b"POINTS 40", b"POINTS 41"),
         (b"COUNT 1 1 1 4", b"COUNT 1 1 1 -4"),
+        (b"COUNT 1 1 1 4", b"COUNT 1 1 1 99999999"),
+        (b"SIZE 4 4 4 1", b"SIZE 4 4 4 4,f4"),
     ],
 )
 def test_bad_headers(tmp_path, old, new):

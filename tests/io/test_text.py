@@ -118,9 +118,8 @@ def test_bad_text(tmp_path, text, says):
 
 
 def test_every_cut_gives_fewer_points_or_a_file_error(tmp_path):
-    path = _write(
-        tmp_path / "a.csv", np.hstack([_POINTS, _NORMALS]), ",", "x,y,z,nx,ny,nz\n"
-    )
+    table = np.hstack([_POINTS, _NORMALS])
+    path = _write(tmp_path / "a.csv", table, ",", "x,y,z,nx,ny,nz\n")
     data = path.read_bytes()
     failed = 0
     for cut in range(len(data)):
