@@ -1,5 +1,6 @@
 """What all tests share: the real data, double precision, the compile cache."""
 
+import gc
 import os
 import pathlib
 
@@ -26,3 +27,11 @@ def x64():
     """Double precision within one test."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _programs_are_dropped():
+    """Compiled programs hold memory maps, of which a process may have 65 530."""
+    yield
+    jax.clear_caches()
+    gc.collect()

@@ -27,25 +27,36 @@ def interpolate(
 
 
 def splat(
-    weights: Float[Array, " n"], q: Float[Array, "n 3"], shape: Shape
+    weights: Float[Array, " n"],
+    q: Float[Array, "n 3"],
+    shape: Shape,
+    *,
+    onto: Float[Array, "x y z"] | None = None,
 ) -> Float[Array, "x y z"]:
-    """W^T weights: every weight is shared among the 8 nodes around its point."""
-    flat = jnp.zeros(math.prod(shape), weights.dtype)
+    """W^T weights: every weight is shared among the 8 nodes around its point.
+
+    `onto`: values of that shape that the shares are added to; zero by default.
+    """
+    flat = _flat(onto, shape, weights.dtype)
     for index, share in _trilinear(q, shape):
         flat = flat.at[index].add(share * weights, mode="promise_in_bounds")
     return flat.reshape(shape)
 
 
 def splat_gradient(
-    vectors: Float[Array, "n 3"], q: Float[Array, "n 3"], shape: Shape
+    vectors: Float[Array, "n 3"],
+    q: Float[Array, "n 3"],
+    shape: Shape,
+    *,
+    onto: Float[Array, "x y z"] | None = None,
 ) -> Float[Array, "x y z"]:
     """sum_p v_p . grad K(q_p - i) at every node i, K the tensor quadratic B-spline.
 
     This is the weak divergence of the vector field that has v_p smeared by K, the right
     side of the Poisson equation in Kazhdan et al. (2006). Points must lie at least half
-    a cell inside the outermost nodes.
+    a cell inside the outermost nodes. `onto` as for `splat`.
     """
-    flat = jnp.zeros(math.prod(shape), vectors.dtype)
+    flat = _flat(onto, shape, vectors.dtype)
     axes = [_quadratic(q[:, d], n) for d, n in enumerate(shape)]
     (bx, wx, gx), (by, wy, gy), (bz, wz, gz) = axes
     for i, j, k in itertools.product(range(3), repeat=3):
@@ -57,6 +68,10 @@ def splat_gradient(
         )
         flat = flat.at[index].add(value, mode="promise_in_bounds")
     return flat.reshape(shape)
+
+
+def _flat(onto, shape, dtype):
+    return jnp.zeros(math.prod(shape), dtype) if onto is None else onto.reshape(-1)
 
 
 def _trilinear(q, shape):

@@ -40,7 +40,7 @@ class Multigrid(eqx.Module):
         """The hierarchy down to a grid of at most 16 nodes an axis."""
         diagonals = [lax.stop_gradient(diagonal)]  # the solution does not depend on it
         while max(diagonals[-1].shape) > _COARSEST and min(diagonals[-1].shape) > 4:
-            diagonals.append(stage(token, restrict, diagonals[-1]))
+            diagonals.append(restrict(diagonals[-1], token=token))
         return Multigrid(tuple(diagonals), lax.stop_gradient(coefficients), token)
 
     def v_cycle(
@@ -50,25 +50,21 @@ class Multigrid(eqx.Module):
         if level + 1 == len(self.diagonals):
             return stage(self.token, self._coarsest, r)
         u, defect = stage(self.token, lambda r: self._first_sweep(r, level), r)
-        coarse = self.v_cycle(stage(self.token, restrict, defect), level + 1)
-        u = stage(self.token, lambda u, c: u + prolong(c, u.shape), u, coarse)
+        coarse = self.v_cycle(restrict(defect, token=self.token), level + 1)
+        u = prolong(coarse, u.shape, onto=u, token=self.token)
         return stage(self.token, lambda u, r: self._sweep(u, r, level), u, r)
 
-    def full(
-        self, b: Float[Array, "x y z"], *, cycles: int = 1
-    ) -> Float[Array, "x y z"]:
-        """An approximation of A^-1 b: every level starts from the coarser solution."""
-        sides = [b]
-        for _ in self.diagonals[1:]:
-            sides.append(stage(self.token, restrict, sides[-1]))
-        u = self.v_cycle(sides[-1], len(sides) - 1)
-        for level in reversed(range(1, len(sides) - 1)):
-            u = stage(self.token, lambda c, s=sides[level].shape: prolong(c, s), u)
-            for _ in range(cycles):
-                u = u + self.v_cycle(self._defect(u, sides[level], level), level)
-        if len(sides) == 1:
-            return u
-        return stage(self.token, lambda c: prolong(c, b.shape), u)
+    def full(self, b: Float[Array, "x y z"], level: int = 0) -> Float[Array, "x y z"]:
+        """An approximation of A_l^-1 b: every level starts from the coarser solution,
+        and the finest is that solution prolonged."""
+        if level + 1 == len(self.diagonals):
+            return stage(self.token, self._coarsest, b)
+        side = restrict(b, token=self.token)
+        u = self.full(side, level + 1)
+        if level + 2 < len(self.diagonals):
+            defect = lambda u, b: b - self._apply(u, level + 1)
+            u = u + self.v_cycle(stage(self.token, defect, u, side), level + 1)
+        return prolong(u, b.shape, token=self.token)
 
     def _apply(self, u, level):
         return laplacian(u, 2.0**level * self.coefficients) + self.diagonals[level] * u
@@ -78,9 +74,6 @@ class Multigrid(eqx.Module):
             self.diagonals[level].shape, 2.0**level * self.coefficients
         )
         return _DAMPING / (diagonal + self.diagonals[level])
-
-    def _defect(self, u, b, level):
-        return stage(self.token, lambda u, b: b - self._apply(u, level), u, b)
 
     def _first_sweep(self, r, level):
         u = self._step(level) * r

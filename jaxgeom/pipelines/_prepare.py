@@ -119,7 +119,7 @@ def _check_extent(centered, scale, has_normals):
             message(
                 "points must not all coincide",
                 f"{len(centered)} equal points",
-                "Check the file: are all coordinates the same?",
+                "Check the units and the columns of the file.",
             )
         )
     spread = np.linalg.svd(

@@ -209,7 +209,7 @@ def _mesh(
 def _with_attributes(mesh, field, cloud, token):
     """The density of samples and the cloud's attributes, read at the vertices."""
     q = field.grid.index_of(mesh.vertices)
-    attributes = {"density": interpolate(field.density, q)}
+    attributes = {"density": field.density_at(mesh.vertices)}
     for name, values in cloud.attributes.items():
         flat = values.reshape(values.shape[0], -1).astype(q.dtype)
         at = field.grid.index_of(cloud.points)

@@ -41,21 +41,21 @@ def sample_geometry(
     real: Bool[Array, " n"],
     shape: tuple[int, int, int],
     *,
-    levels: int = 1,
+    levels: int = 0,
 ) -> SampleGeometry:
     """The area and the noise of samples at node indices q of a grid of `shape`.
 
     **Arguments:**
 
     - `normals`: [n, 3], unit; `real`: [n], False for padding.
-    - `levels`: how many grids, each twice as coarse, the density is estimated on. The
-      finest that holds enough samples around a point serves it.
+    - `levels`: how many grids beyond the first, each twice as coarse, the density is
+      estimated on. The finest that holds enough samples around a point serves it.
 
     The noise is the scatter of n . (x - m) about its local mean, where m is the mean of
     the samples in the kernel: a plane gives 0, so does constant curvature.
     """
     area = None
-    for level in reversed(range(1, levels + 1)):
+    for level in reversed(range(1, levels + 2)):
         coarse, grid_shape = at_level(q, shape, level)
         here = _neighborhood(coarse, real, grid_shape, level)
         area = here.area if area is None else _blend(here, area)

@@ -18,12 +18,8 @@ Where a sample stands for more than a cell, its normal is smeared by the kernel 
 coarser grid, so that sparse parts of a scan close as well as dense ones.
 """
 
-import math
-from collections.abc import Callable
-
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core import (
@@ -34,20 +30,12 @@ from .._core import (
     safe_normalize,
     stage,
 )
-from ..linear import (
-    LinearSolution,
-    Multigrid,
-    conjugate_gradients,
-    cosine_solve,
-    interpolate,
-    laplacian,
-    prolong,
-    splat,
-    splat_gradient,
-)
+from ..linear import LinearSolution, cosine_solve, interpolate
 from ..shapes import Grid, PointCloud
 from ._boundary import AbstractBoundary, Neumann
 from ._density import at_level, sample_geometry
+from ._divergence import divergence, levels_for
+from ._minimise import minimise
 from ._solution import FieldSolution, PoissonStats
 from ._spread import spread
 
@@ -64,7 +52,7 @@ class Poisson(eqx.Module):
 
     boundary: AbstractBoundary = Neumann()
     levels: int | None = eqx.field(static=True, default=None)
-    rtol: float = 1e-2
+    rtol: float = 0.05
     max_steps: int = 50
 
     def __call__(self, cloud, grid, *, weights=None, token=None) -> FieldSolution:
@@ -84,7 +72,7 @@ class ScreenedPoisson(eqx.Module):
     screening: Float[Array, ""] | float | None = None
     boundary: AbstractBoundary = Neumann()
     levels: int | None = eqx.field(static=True, default=None)
-    rtol: float = 1e-2
+    rtol: float = 0.05
     max_steps: int = 50
 
     def __call__(self, cloud, grid, *, weights=None, token=None) -> FieldSolution:
@@ -145,36 +133,26 @@ class _Samples(eqx.Module):
 
 
 def _solve(cloud, grid, method, screening, weights, token) -> FieldSolution:
-    levels = _levels(method, cloud, grid)
+    shape, levels = grid.shape, method.levels
+    if levels is None:
+        levels = levels_for(cloud.points.shape[0], shape)
     samples = _samples(cloud, grid)
     unit = jnp.prod(grid.spacing) ** (1 / 3)
-    found = stage(
-        token,
-        lambda s: sample_geometry(
-            s.q, s.normals, s.real, grid.shape, levels=levels + 1
-        ),
-        samples,
-    )
+    measure = lambda s: sample_geometry(s.q, s.normals, s.real, shape, levels=levels)
+    found = stage(token, measure, samples)
     if screening is None:
         screening = _screening_for(found.noise)
     strength = found.area if weights is None else found.area * weights
-    scaled = samples.normals * (unit / grid.spacing)
-    side = stage(
-        token,
-        lambda q, n, a: _divergence(q, n * a[:, None], found.area, grid.shape, levels),
-        samples.q,
-        scaled,
-        strength,
-    )
+    vectors = samples.normals * (unit / grid.spacing) * strength[:, None]
+    side = divergence(samples.q, vectors, found.area, shape, levels, token=token)
     coefficients = (unit / grid.spacing) ** 2
     # A sample of many cells belongs to a coarser grid, whose 1 / h is weaker.
     pull = screening * strength / jnp.sqrt(jnp.maximum(found.area, 1.0))
-    solution = _minimise(side, samples.q, pull, coefficients, method, token)
+    solution = _minimiser(side, samples.q, pull, coefficients, method, token)
     at_samples = interpolate(solution.value, samples.q)
     level = safe_divide(jnp.sum(strength * at_samples), jnp.sum(strength))
     area = found.area * unit**2
-    inverse = safe_divide(1.0, area)[:, None]
-    density = spread(inverse, samples.q, samples.real, grid.shape, token=token)[..., 0]
+    density = _density(samples, area, shape, token)
     stats = PoissonStats(
         solution.residual,
         solution.steps,
@@ -185,6 +163,23 @@ def _solve(cloud, grid, method, screening, weights, token) -> FieldSolution:
     )
     result = first_failure(samples.result, solution.result)
     return FieldSolution(grid, solution.value, level, density, result, stats)
+
+
+def _minimiser(side, q, pull, coefficients, method, token) -> LinearSolution:
+    fixed = method.boundary.fixed(side.shape)
+    if fixed is None and isinstance(method, Poisson):
+        value = cosine_solve(side, coefficients)
+        zero = jnp.zeros((), value.dtype)
+        return LinearSolution(value, zero, jnp.int32(0), RESULTS.successful)
+    settings = dict(rtol=method.rtol, max_steps=method.max_steps, token=token)
+    return minimise(side, q, pull, coefficients, fixed, **settings)
+
+
+def _density(samples, area, shape, token):
+    """The samples per unit of area, extended to the grid of twice the spacing."""
+    q, shape = at_level(samples.q, shape, 1)
+    inverse = safe_divide(1.0, area)[:, None]
+    return spread(inverse, q, samples.real, shape, token=token)[..., 0]
 
 
 def _samples(cloud, grid) -> _Samples:
@@ -211,46 +206,6 @@ def _samples(cloud, grid) -> _Samples:
     return _Samples(q, normals, real, result, jnp.sum(cloud.mask & ~real))
 
 
-def _levels(method, cloud, grid) -> int:
-    """How many coarser grids the samples need, from their number and the resolution.
-
-    A surface of four middle sections of the grid, shared by n samples of equal area,
-    puts each sample on the level where it fills one cell.
-    """
-    if method.levels is not None:
-        return method.levels
-    cells = 4 * float(np.prod(grid.shape)) ** (2 / 3)
-    per_sample = max(cells / max(cloud.points.shape[0], 1), 1.0)
-    deepest = math.floor(math.log2(min(grid.shape))) - 3
-    return max(min(math.ceil(math.log(per_sample, 4)), deepest), 0)
-
-
-def _divergence(q, vectors, area, shape, levels):
-    """The right side; each sample is smeared on the grid where it fills one cell.
-
-    Prolongation is the refinement rule of the quadratic B-spline, so that the kernel of
-    a coarse grid, prolonged, is the wide kernel on the fine one. In units of the finer
-    grid it is 1/4 as strong per level: 1/16 for area and gradient together with the
-    factor 4 of the coarse grid's own unit of area.
-    """
-    side = None
-    for level in reversed(range(levels + 1)):
-        coarse, level_shape = at_level(q, shape, level)
-        share = _share(area, level, levels)
-        here = splat_gradient(
-            vectors * share[:, None] / 4.0**level, coarse, level_shape
-        )
-        side = here if side is None else here + prolong(side, level_shape) / 4
-    return side
-
-
-def _share(area, level, last):
-    """How much of a sample of this area (in cells) a level gets: a hat in log4."""
-    fitting = jnp.log(jnp.maximum(area, 1.0)) / jnp.log(4.0)
-    fitting = jnp.minimum(fitting, last)
-    return jnp.maximum(1 - jnp.abs(fitting - level), 0.0)
-
-
 def _screening_for(noise):
     """alpha for samples whose noise is `noise` spacings.
 
@@ -261,45 +216,3 @@ def _screening_for(noise):
 
 
 _NOISE_CONSTANT = 0.1
-
-
-def _minimise(side, q, pull, coefficients, method, token) -> LinearSolution:
-    """Solve (L + W^T pull W) u = side with the fixed nodes at +1/2."""
-    shape = side.shape
-    fixed = method.boundary.fixed(shape)
-    if fixed is None and isinstance(method, Poisson):
-        value = cosine_solve(side, coefficients)
-        zero = jnp.zeros((), value.dtype)
-        return LinearSolution(value, zero, jnp.int32(0), RESULTS.successful)
-
-    def operator(u):
-        smooth = stage(token, lambda u: laplacian(u, coefficients), u)
-        pulled = stage(token, lambda u: splat(pull * interpolate(u, q), q, shape), u)
-        return smooth + pulled
-
-    diagonal = stage(token, lambda p: splat(p, q, shape), pull)
-    if fixed is None:
-        multigrid = Multigrid.of(diagonal, coefficients, token)
-        return _iterate(operator, side, multigrid, lambda u: u, method)
-    free = (~fixed).astype(side.dtype)
-    outside = 0.5 * (1 - free)
-    # Fixed nodes are walls to the preconditioner too, stiffer than any neighbor.
-    stiff = diagonal + (1 - free) * 100 * jnp.max(coefficients)
-    multigrid = Multigrid.of(stiff, coefficients, token)
-    masked = lambda u: free * operator(free * u) + (1 - free) * u
-    rest = free * (side - operator(outside))
-    out = _iterate(masked, rest, multigrid, lambda u: free * u, method)
-    return eqx.tree_at(lambda s: s.value, out, out.value + outside)
-
-
-def _iterate(
-    operator: Callable, side, multigrid: Multigrid, project: Callable, method
-) -> LinearSolution:
-    return conjugate_gradients(
-        operator,
-        side,
-        rtol=method.rtol,
-        max_steps=method.max_steps,
-        preconditioner=lambda r: project(multigrid.v_cycle(project(r))),
-        start=lambda b: project(multigrid.full(b)),
-    )

@@ -30,13 +30,14 @@ class FieldSolution(eqx.Module):
     """A field sampled on a grid; its surface is where `values` equal `level`.
 
     Itself a field: `solution(point)` is the trilinear interpolant less the level,
-    negative inside. `density` holds the samples per unit of area around each node.
+    negative inside. `density` holds the samples per unit of area around each node of
+    the grid of twice the spacing (`grid.coarser()`).
     """
 
     grid: Grid
     values: Float[Array, "x y z"]
     level: Float[Array, ""]
-    density: Float[Array, "x y z"]
+    density: Float[Array, "i j k"]
     result: RESULTS
     stats: PoissonStats
 
@@ -44,3 +45,7 @@ class FieldSolution(eqx.Module):
         """The value at one point [3], clamped to the box."""
         q = self.grid.index_of(point)[None]
         return interpolate(self.values, q)[0] - self.level
+
+    def density_at(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
+        """The samples per unit of area around points [n, 3]."""
+        return interpolate(self.density, self.grid.coarser().index_of(points))

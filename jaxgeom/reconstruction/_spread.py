@@ -32,15 +32,16 @@ def _push_pull(count, totals, token):
     """The extended mean of every channel."""
     if max(count.shape) <= 2:
         return [safe_divide(total, count) for total in totals]
-    coarse_count = stage(token, restrict, count)
-    coarse_totals = [stage(token, restrict, total) for total in totals]
+    coarse_count = restrict(count, token=token)
+    coarse_totals = [restrict(total, token=token) for total in totals]
     around = _push_pull(coarse_count, coarse_totals, token)
-    pull = lambda total, coarse: stage(token, _pull, count, total, coarse)
-    return [pull(t, c) for t, c in zip(totals, around, strict=True)]
+    finer = [prolong(c, count.shape, token=token) for c in around]
+    return [
+        stage(token, _pull, count, total, outside)
+        for total, outside in zip(totals, finer, strict=True)
+    ]
 
 
-def _pull(count, total, coarse):
+def _pull(count, total, outside):
     trust = jnp.clip(count, 0, 1)
-    return trust * safe_divide(total, count) + (1 - trust) * prolong(
-        coarse, count.shape
-    )
+    return trust * safe_divide(total, count) + (1 - trust) * outside

@@ -53,6 +53,11 @@ class Grid(eqx.Module):
         origin = (low + high) / 2 - side / 2 + spacing / 2
         return Grid(origin, spacing, (resolution,) * 3)
 
+    def coarser(self) -> "Grid":
+        """The grid of twice the spacing; node c lies between nodes 2c and 2c + 1."""
+        shape = tuple(max(-(-n // 2), 2) for n in self.shape)
+        return Grid(self.origin + self.spacing / 2, 2 * self.spacing, shape)
+
     def nodes(self) -> Float[Array, "x y z 3"]:
         """The positions of all nodes."""
         axes = [
