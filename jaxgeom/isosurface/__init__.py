@@ -1,5 +1,8 @@
 """From a sampled field to a mesh: one signature, one result for all extractors."""
 
+from ._ambiguity import AbstractFaceRule as AbstractFaceRule
+from ._ambiguity import AsymptoticDecider as AsymptoticDecider
+from ._ambiguity import SeparateInside as SeparateInside
 from ._classify import Counts as Counts
 from ._extract import extract as extract
 from ._extract import pad_outside as pad_outside

@@ -40,14 +40,29 @@ def edges() -> tuple[Edge, ...]:
 
 
 @functools.cache
-def loops(case: int) -> tuple[tuple[Edge, ...], ...]:
-    """The oriented loops of cut edges of the case whose bit c says: c is inside."""
+def ambiguous_faces(case: int) -> tuple[int, ...]:
+    """The faces whose inside corners are the two ends of a diagonal."""
+    inside = [[case >> c & 1 for c in ring] for ring in faces()]
+    return tuple(
+        f for f, (a, b, c, d) in enumerate(inside) if a == c and b == d and a != b
+    )
+
+
+@functools.cache
+def loops(case: int, joined: int = 0) -> tuple[tuple[Edge, ...], ...]:
+    """The oriented loops of cut edges of the case whose bit c says: c is inside.
+
+    On an ambiguous face f with bit f of `joined`, the inside corners are connected:
+    every exit is joined to the enter after it.
+    """
     follows = {}
-    for ring in faces():
+    for f, ring in enumerate(faces()):
         inside = [bool(case >> c & 1) for c in ring]
+        connected = f in ambiguous_faces(case) and joined >> f & 1
         for i in range(4):
             if inside[i] and not inside[(i + 1) % 4]:
-                follows[edge(ring[i], ring[(i + 1) % 4])] = _enter(ring, inside, i)
+                enter = _enter(ring, inside, (i + 2) % 4 if connected else i)
+                follows[edge(ring[i], ring[(i + 1) % 4])] = enter
     out = []
     while follows:
         loop = [min(follows)]

@@ -57,7 +57,8 @@ class Extraction(eqx.Module):
 
     On overflow `result` is `capacity_exceeded` and the mesh a valid prefix: its faces
     name existing vertices. Other statuses: `nonfinite_input` (such samples count as
-    outside), `no_surface`. The required sizes are exact in any case.
+    outside), `no_surface`. The required sizes are exact in any case, but for the faces
+    with a decider (at most as many).
     """
 
     mesh: TriangleMesh

@@ -8,19 +8,19 @@ from .._core import prefix_sum, stage
 from ._bits import WORD, Owners, below, expand, expand_filled, popcount, select
 from ._classify import Bits, Numbers
 from ._extraction import Capacity
-from ._tables import CODE_BITS, MAX_TRIANGLES, case_tables
+from ._tables import CODE_BITS, CaseTables, case_tables, decided_tables
 
 _BIT = WORD.bit_length() - 1
 
 
 class Cells(eqx.Module):
-    """Active cells: the word and the bit of the lower corner, the case, the faces.
+    """Active cells: the word and the bit of the lower corner, the row of the tables.
 
-    Bit and case share an integer, since the faces read both at once.
+    Bit and row share an integer, since the faces read both at once.
     """
 
     word: Int[Array, " c"]
-    bit_and_case: Int[Array, " c"]
+    bit_and_row: Int[Array, " c"]
     real: Bool[Array, " c"]
     first_face: Int[Array, " c"]
     num_faces: Int[Array, ""]
@@ -37,12 +37,13 @@ def emit_faces(bits: Bits, numbers: Numbers, capacity: Capacity, token) -> Faces
     """The faces of the active cells, in the order of the cells."""
     first, size = numbers.first_cell, capacity.cells
     owners = expand(numbers.cells, first, size, token)
-    word_and_case = stage(token, _cases, owners, bits)
+    tables = case_tables() if bits.joined is None else decided_tables()
+    place = stage(token, lambda o, b: _places(o, b, tables), owners, bits)
     cells = stage(
-        token, lambda c, n: _cells(*c, n, bits, capacity), word_and_case, numbers
+        token, lambda p, n: _cells(*p, n, bits, capacity, tables), place, numbers
     )
     slots = expand_filled(cells.first_face, cells.real, capacity.faces, token)
-    codes = stage(token, _codes, slots, cells)
+    codes = stage(token, lambda s, c: _codes(s, c, tables), slots, cells)
     corners = [
         stage(token, lambda *a, i=i: _vertex_number(*a, i), codes, numbers, bits.cut)
         for i in range(3)
@@ -51,10 +52,30 @@ def emit_faces(bits: Bits, numbers: Numbers, capacity: Capacity, token) -> Faces
     return Faces(faces, jnp.minimum(cells.num_faces, capacity.faces))
 
 
-def _cases(owners: Owners, bits):
+def _places(owners: Owners, bits, tables: CaseTables):
     words = bits.cells.reshape(-1).at[owners.owner].get(mode="promise_in_bounds")
     bit = select(words, owners.place)
-    return owners.owner, bit | _case(bits.inside, owners.owner, bit) << _BIT
+    row = _case(bits.inside, owners.owner, bit)
+    if tables.row is not None:
+        row = jnp.asarray(tables.row)[
+            row << 6 | _joined(bits.joined, owners.owner, bit)
+        ]
+    return owners.owner, bit | row << _BIT
+
+
+def _joined(joined, word, bit):
+    """The 6 faces of each cell whose inside corners are connected, as bits."""
+    _, _, ny, per_line = joined.shape
+    out = jnp.zeros_like(bit)
+    for axis in range(3):
+        flat = joined[axis].reshape(-1)
+        for side in (0, 1):
+            step = side * (ny * per_line, per_line, 0)[axis]
+            place = bit + (side if axis == 2 else 0)
+            words = flat.at[word + step + (place >> _BIT)].get(mode="clip")
+            one = words >> (place & (WORD - 1)).astype(jnp.uint32) & 1
+            out = out | one.astype(int) << (2 * axis + side)
+    return out
 
 
 def _case(inside, word, bit):
@@ -73,13 +94,12 @@ def _case(inside, word, bit):
     return case
 
 
-def _cells(word, bit_and_case, numbers, bits, capacity) -> Cells:
+def _cells(word, bit_and_row, numbers, bits, capacity, tables) -> Cells:
     real = jnp.arange(capacity.cells) < numbers.needed.cells
     real = real & (word < _word_limit(numbers, bits, capacity))
-    triangles = jnp.asarray(case_tables()[0])
-    faces = jnp.where(real, triangles[bit_and_case >> _BIT], 0)
+    faces = jnp.where(real, jnp.asarray(tables.counts)[bit_and_row >> _BIT], 0)
     first = prefix_sum(faces)
-    return Cells(word, bit_and_case, real, first, first[-1] + faces[-1])
+    return Cells(word, bit_and_row, real, first, first[-1] + faces[-1])
 
 
 def _word_limit(numbers, bits, capacity):
@@ -104,12 +124,11 @@ class _Codes(eqx.Module):
     edges: Int[Array, " f"]
 
 
-def _codes(slots: Owners, cells) -> _Codes:
+def _codes(slots: Owners, cells, tables) -> _Codes:
     word = cells.word.at[slots.owner].get(mode="promise_in_bounds")
-    both = cells.bit_and_case.at[slots.owner].get(mode="promise_in_bounds")
-    place = jnp.clip(slots.place, 0, MAX_TRIANGLES - 1)
-    table = jnp.asarray(case_tables()[1])
-    edges = table[(both >> _BIT) * MAX_TRIANGLES + place]
+    both = cells.bit_and_row.at[slots.owner].get(mode="promise_in_bounds")
+    place = jnp.clip(slots.place, 0, tables.width - 1)
+    edges = jnp.asarray(tables.triangles)[(both >> _BIT) * tables.width + place]
     return _Codes(word, both & (WORD - 1), edges)
 
 

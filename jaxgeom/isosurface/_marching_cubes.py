@@ -24,6 +24,7 @@ from .._core import (
     stage,
 )
 from ..shapes import Grid, TriangleMesh
+from ._ambiguity import AbstractFaceRule, SeparateInside
 from ._classify import Counts, classify
 from ._extraction import Capacity, Extraction
 from ._faces import emit_faces
@@ -35,16 +36,20 @@ from ._vertices import Samples, directions, find_edges, positions
 _CLEARANCE = 1e-3
 
 _LINEAR = Linear()
+_SEPARATE = SeparateInside()
 
 
 class MarchingCubes(eqx.Module):
     """Settings of marching cubes.
 
     - `placement`: where vertices lie on their edges, `Linear()` or `Cubic()`.
+    - `ambiguity`: of faces with the inside at both ends of a diagonal,
+      `SeparateInside()` or `AsymptoticDecider()`.
     - `normals`: static; whether vertex normals are computed.
     """
 
     placement: AbstractPlacement = _LINEAR
+    ambiguity: AbstractFaceRule = _SEPARATE
     normals: bool = eqx.field(static=True, default=True)
 
     def __call__(self, values, grid, level=0.0, *, capacity, token=None) -> Extraction:
@@ -55,13 +60,14 @@ class MarchingCubes(eqx.Module):
             level,
             capacity=capacity,
             placement=self.placement,
+            ambiguity=self.ambiguity,
             normals=self.normals,
             token=token,
         )
 
     def measure(self, values, level=0.0, *, token=None) -> Counts:
         """The sizes that the extraction needs, without making it."""
-        return count(values, level, token=token)
+        return count(values, level, ambiguity=self.ambiguity, token=token)
 
 
 def marching_cubes(
@@ -71,6 +77,7 @@ def marching_cubes(
     *,
     capacity: Capacity,
     placement: AbstractPlacement = _LINEAR,
+    ambiguity: AbstractFaceRule = _SEPARATE,
     normals: bool = True,
     token: Bool[Array, ""] | None = None,
 ) -> Extraction:
@@ -88,6 +95,8 @@ def marching_cubes(
     - `values`: [x, y, z] samples at the nodes of `grid`, at least 2 along each axis.
     - `capacity`: static sizes; `count` measures them, `extract` does all of it.
     - `placement`: `Linear()`, or `Cubic()` for smooth fields.
+    - `ambiguity`: `SeparateInside()`, or `AsymptoticDecider()`, which connects across
+      the faces of the grid as the trilinear interpolant does.
     - `normals`: static; unit vertex normals from central differences of the values.
     - `token`: a run-time true that keeps stages apart on CPUs (see `stage`), or None.
 
@@ -99,7 +108,7 @@ def marching_cubes(
     values, level = _as_float(values, level)
     _check(values, grid)
     # The sign of a sample is piecewise constant: the topology has no derivative.
-    bits, numbers = classify(*lax.stop_gradient((values, level)), token)
+    bits, numbers = classify(*lax.stop_gradient((values, level)), ambiguity, token)
     edges = find_edges(bits, numbers, values.shape[2], capacity.vertices, token)
     t = stage(token, lambda *a: _parameter(placement, *a), values, edges, level)
     vertices = stage(token, positions, t, edges, grid)
@@ -121,10 +130,15 @@ def count(
     values: Float[Array, "x y z"],
     level: Float[Array, ""] | float = 0.0,
     *,
+    ambiguity: AbstractFaceRule = _SEPARATE,
     token: Bool[Array, ""] | None = None,
 ) -> Counts:
-    """The numbers of vertices, faces and active cells of `marching_cubes`."""
-    return classify(*_as_float(values, level), token)[1].needed
+    """The numbers of vertices, faces and active cells of `marching_cubes`.
+
+    With a decider the number of faces is an upper bound, near where faces of the grid
+    are seldom ambiguous.
+    """
+    return classify(*_as_float(values, level), ambiguity, token)[1].needed
 
 
 def _as_float(values, level):

@@ -52,7 +52,9 @@ def sample_surface(mesh: TriangleMesh, num: int, *, key: Array) -> SurfaceSample
     s = jnp.sqrt(s)
     barycentric = jnp.stack([1 - s, s * (1 - t), s * t], axis=-1)
     barycentric = jnp.where(found[:, None], barycentric, 0)
-    triangles = corners(mesh).at[faces].get(mode="fill", fill_value=0)
+    triangles = jnp.zeros((num, 3, 3), dtype)
+    if mesh.faces.shape[0] > 0:
+        triangles = corners(mesh).at[faces].get(mode="fill", fill_value=0)
     points = jnp.einsum("ni,nid->nd", barycentric, triangles)
     normals = safe_normalize(doubled(triangles))
     return SurfaceSamples(points, normals, faces, barycentric, found)

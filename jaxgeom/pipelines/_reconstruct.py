@@ -14,7 +14,13 @@ from .._core import (
     message,
     runtime_token,
 )
-from ..isosurface import Capacity, MarchingCubes, pad_outside
+from ..isosurface import (
+    AsymptoticDecider,
+    Capacity,
+    Cubic,
+    MarchingCubes,
+    pad_outside,
+)
 from ..linear import interpolate
 from ..meshes import (
     Topology,
@@ -27,6 +33,8 @@ from ..reconstruction import FieldSolution, PoissonStats, ScreenedPoisson, sprea
 from ..shapes import Grid, PointCloud, TriangleMesh, stack
 from ._memory import check_memory
 from ._prepare import prepare
+
+_EXTRACTOR = MarchingCubes(placement=Cubic(), ambiguity=AsymptoticDecider())
 
 
 class Reconstruction(eqx.Module):
@@ -70,7 +78,8 @@ def reconstruct(
     - `cloud`: a `PointCloud`, or points [n, 3] in any unit.
     - `resolution`: nodes along each side of the cube around the cloud.
     - `method`: `ScreenedPoisson()` by default, or `Poisson()`.
-    - `extractor`: `MarchingCubes()` by default.
+    - `extractor`: by default `MarchingCubes` with cubic placement and the asymptotic
+      decider.
     - `weights`: [n] confidence of the points.
     - `padding`: width of the empty margin, as a share of the longest side.
     - `trim`: remove the surface where samples are sparser than `trim` times the median
@@ -83,7 +92,7 @@ def reconstruct(
     """
     check_memory(_checked(resolution), jnp.zeros(()).dtype.itemsize)
     method = ScreenedPoisson() if method is None else method
-    extractor = MarchingCubes() if extractor is None else extractor
+    extractor = _EXTRACTOR if extractor is None else extractor
     ready = prepare(cloud, weights=weights)
     unit, confidence, token = *_padded(ready), runtime_token()
     field = _solve(unit, confidence, method, resolution, padding, token)
@@ -140,7 +149,7 @@ def reconstruct_jit(
             )
         )
     method = ScreenedPoisson() if method is None else method
-    extractor = MarchingCubes() if extractor is None else extractor
+    extractor = _EXTRACTOR if extractor is None else extractor
     grid = Grid.around(cloud, resolution=resolution, padding=padding)
     capacity = Capacity.for_surface(grid.shape) if capacity is None else capacity
     field = method(cloud, grid, weights=weights, token=token)

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..linear import coarse_shape, interpolate, smooth, splat
+from ..linear import coarse_shape, interpolate, prolong, smooth, splat
 
 # Standard deviation of the kernel in spacings of the grid that it lives on.
 _WIDTH = (5 / 6) ** 0.5
@@ -28,10 +28,14 @@ class SampleGeometry(eqx.Module):
     """What each sample stands for, in units of grid cells.
 
     - `area`: [n], the surface area per sample, in squared spacings; 0 for padding.
+    - `density`: [i, j, k], samples per squared spacing around the nodes of the grid of
+      twice the spacing. It falls to zero over the width of the kernel where the surface
+      was not seen.
     - `noise`: [], the standard deviation of the samples across the surface, spacings.
     """
 
     area: Float[Array, " n"]
+    density: Float[Array, "i j k"]
     noise: Float[Array, ""]
 
 
@@ -54,13 +58,15 @@ def sample_geometry(
     The noise is the scatter of n . (x - m) about its local mean, where m is the mean of
     the samples in the kernel: a plane gives 0, so does constant curvature.
     """
-    area = None
+    area = density = None
     for level in reversed(range(1, levels + 2)):
         coarse, grid_shape = at_level(q, shape, level)
-        here = _neighborhood(coarse, real, grid_shape, level)
-        area = here.area if area is None else _blend(here, area)
+        total = smooth(splat(real.astype(q.dtype), coarse, grid_shape))
+        here = _neighborhood(coarse, total, level)
+        area = here.area if area is None else _blend(here.trust, here.area, area)
+        density = _density(total, level, density)
     noise = _noise(coarse, normals, real, grid_shape, here)
-    return SampleGeometry(jnp.where(real, area, 0.0), noise)
+    return SampleGeometry(jnp.where(real, area, 0.0), density, noise)
 
 
 class _Neighborhood(eqx.Module):
@@ -77,8 +83,23 @@ class _Neighborhood(eqx.Module):
     trust: Float[Array, " n"]
 
 
-def _blend(here, coarser):
-    return here.trust * here.area + (1 - here.trust) * coarser
+def _blend(trust, here, coarser):
+    return trust * here + (1 - trust) * coarser
+
+
+def _density(total, level, coarser):
+    """Samples per squared fine spacing, from the sums of one grid and what the coarser
+    grids say."""
+    per_coarse_area = (2 * jnp.pi) ** 0.5 * _WIDTH * total
+    here = per_coarse_area / 4.0**level
+    if coarser is None:
+        return here
+    return _blend(_trust(per_coarse_area), here, prolong(coarser, total.shape))
+
+
+def _trust(density):
+    """In [0, 1]: whether the kernel holds enough samples, at `density` per area."""
+    return jnp.clip(4 * jnp.pi * _WIDTH**2 * density / _ENOUGH, 0.0, 1.0)
 
 
 def at_level(q, shape, level):
@@ -88,17 +109,12 @@ def at_level(q, shape, level):
     return q, shape
 
 
-def _neighborhood(q, real, shape, level) -> _Neighborhood:
-    weights = real.astype(q.dtype)
-    total = interpolate(smooth(splat(weights, q, shape)), q)
+def _neighborhood(q, total, level) -> _Neighborhood:
     own = _own_weight(q)
     # A sample alone still has rounding error for company: at most 1e4 cells of area.
-    smallest = 1e-4 * own
-    others = jnp.maximum(total - own, smallest)
-    coarse_area = 1 / ((2 * jnp.pi) ** 0.5 * _WIDTH * others)
-    num_others = 4 * jnp.pi * _WIDTH**2 / coarse_area
-    trust = jnp.clip(num_others / _ENOUGH, 0.0, 1.0)
-    return _Neighborhood(own, others, coarse_area * 4.0**level, trust)
+    others = jnp.maximum(interpolate(total, q) - own, 1e-4 * own)
+    density = (2 * jnp.pi) ** 0.5 * _WIDTH * others
+    return _Neighborhood(own, others, 4.0**level / density, _trust(density))
 
 
 def _own_weight(q):

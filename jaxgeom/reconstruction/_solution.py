@@ -30,8 +30,9 @@ class FieldSolution(eqx.Module):
     """A field sampled on a grid; its surface is where `values` equal `level`.
 
     Itself a field: `solution(point)` is the trilinear interpolant less the level,
-    negative inside. `density` holds the samples per unit of area around each node of
-    the grid of twice the spacing (`grid.coarser()`).
+    negative inside. `density` holds the samples per unit of area of surface around each
+    node of the grid of twice the spacing (`grid.coarser()`); it falls to zero where
+    the surface was not seen.
     """
 
     grid: Grid

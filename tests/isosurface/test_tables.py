@@ -16,7 +16,7 @@ def test_numbers_of_loops_and_triangles():
     lengths = [len(loop) for case in CASES for loop in loops(case)]
     assert max(per_case) == 4 and sum(per_case) == 358
     assert np.bincount(lengths)[3:].tolist() == [144, 66, 72, 52, 24]
-    assert np.bincount(case_tables()[0]).tolist() == [2, 16, 50, 80, 76, 32]
+    assert np.bincount(case_tables().counts).tolist() == [2, 16, 50, 80, 76, 32]
 
 
 def test_number_of_ambiguous_faces():

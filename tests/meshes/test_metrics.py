@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.spatial
+import trimesh
 
 from jaxgeom.meshes import (
     chamfer,
@@ -17,7 +18,7 @@ from jaxgeom.meshes import (
 )
 from jaxgeom.shapes import PointCloud, TriangleMesh
 
-from .shapes_for_tests import central_difference, padded, peer
+from .shapes_for_tests import central_difference, padded
 
 
 def two_clouds(n=90, m=70):
@@ -126,10 +127,19 @@ def test_vmap_is_loop():
         assert batched[i] == pytest.approx(float(chamfer(x[i], y[i])), rel=1e-5)
 
 
+def peer_distances(mesh, points):
+    """The distances of points to a mesh: the smallest over all its triangles."""
+    triangles = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+    f, n = len(triangles), len(points)
+    pairs = np.repeat(triangles, n, axis=0), np.tile(points, (f, 1))
+    feet = trimesh.triangles.closest_point(*pairs)
+    return np.linalg.norm(feet - pairs[1], axis=1).reshape(f, n).min(axis=0)
+
+
 def test_point_to_mesh_agrees_with_trimesh(x64):
     mesh = icosphere(1, radius=1.4)
     a, _ = two_clouds(60)
-    _, distances, _ = peer(mesh).nearest.on_surface(np.asarray(a.points))
+    distances = peer_distances(mesh, np.asarray(a.points))
     found = jax.jit(point_to_mesh)(a, mesh)
     np.testing.assert_allclose(found.distances, distances, atol=1e-10)
     assert found.rms == pytest.approx(np.sqrt(np.mean(distances**2)))
@@ -153,11 +163,11 @@ def test_evaluation_of_concentric_spheres():
     e = jax.jit(lambda a, b, k: evaluate(a, b, key=k, num=2000))(
         found, truth, jax.random.key(0)
     )
-    # The faces of the two spheres are parallel: 0.05 apart, up to the sagitta.
+    # The faces of the two spheres are parallel, and 0.05 apart less the sagitta.
     assert e.rms_to_reference == pytest.approx(0.05, rel=0.02)
     assert e.rms_from_reference == pytest.approx(0.05, rel=0.02)
     assert e.rms == pytest.approx(0.05, rel=0.02)
-    assert 0.05 <= e.hausdorff < 0.052
+    assert 0.049 <= e.hausdorff < 0.052
     assert e.chamfer == pytest.approx((e.accuracy + e.completeness) / 2, rel=1e-6)
     assert e.chamfer > e.rms
     assert e.f_score < 0.01
