@@ -27,9 +27,12 @@ def stage(token: Bool[Array, ""] | None, function: Callable, *args):
     """
     if token is None:
         return function(*args)
-    shapes = jax.eval_shape(function, *args)
+    # Under jit the function is traced once, for its shapes and for the conditional.
+    # The lambda: bound methods of modules that hold tracers have no hash.
+    run = jax.jit(lambda *operands: function(*operands))
+    shapes = jax.eval_shape(run, *args)
 
     def never(_):
         return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
 
-    return jax.lax.cond(token, lambda operands: function(*operands), never, args)
+    return jax.lax.cond(token, lambda operands: run(*operands), never, args)

@@ -35,8 +35,13 @@ class Capacity(eqx.Module):
 
     @staticmethod
     def holding(vertices: int, faces: int, cells: int) -> "Capacity":
-        """The capacity for at least these counts, rounded up to shared buckets."""
-        return Capacity(bucket(vertices), bucket(faces), bucket(cells))
+        """The capacity for at least these counts, rounded up to shared buckets.
+
+        A closed surface has about as many cells as vertices and twice as many faces:
+        one bucket for the three gives far fewer programs than three.
+        """
+        size = bucket(max(vertices, -(-faces // 2), cells))
+        return Capacity(size, 2 * size, size)
 
     @staticmethod
     def for_surface(shape: tuple[int, int, int], *, areas: float = 4.0) -> "Capacity":

@@ -2,6 +2,7 @@
 
 from ._cg import LinearSolution as LinearSolution
 from ._cg import conjugate_gradients as conjugate_gradients
+from ._cg import iterate as iterate
 from ._cosine import CosineTransform as CosineTransform
 from ._cosine import cosine_solve as cosine_solve
 from ._interpolation import interpolate as interpolate

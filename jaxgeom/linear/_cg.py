@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -48,40 +49,75 @@ def conjugate_gradients(
     Hestenes and Stiefel (1952).
     """
 
-    def solve(matvec, rhs):
-        return _iterate(matvec, rhs, rtol, max_steps, preconditioner, start)
+    # The transposed system is the same one: under jit it is traced only once.
+    @jax.jit
+    def solve(rhs):
+        out = iterate(
+            operator,
+            rhs,
+            rtol=rtol,
+            max_steps=max_steps,
+            preconditioner=preconditioner,
+            start=start,
+        )
+        return out.value, (out.residual, out.steps, out.result)
 
-    x, (residual, steps) = lax.custom_linear_solve(
-        operator, b, solve, symmetric=True, has_aux=True
+    x, (residual, steps, result) = lax.custom_linear_solve(
+        operator, b, lambda _, rhs: solve(rhs), symmetric=True, has_aux=True
     )
-    converged = residual <= rtol
-    result = RESULTS.where(converged, RESULTS.successful, RESULTS.not_converged)
     return LinearSolution(x, residual, steps, result)
 
 
-def _iterate(matvec, b, rtol, max_steps, preconditioner, start):
+class _State(eqx.Module):
+    """Where the iteration stands; `square` is |r|^2."""
+
+    x: Float[Array, "..."]
+    r: Float[Array, "..."]
+    p: Float[Array, "..."]
+    rz: Float[Array, ""]
+    square: Float[Array, ""]
+    steps: Int[Array, ""]
+    phase: Int[Array, ""]
+
+
+# The first pass finds the residual of the start, the last one the true residual.
+_OPENING, _ITERATING, _CLOSING, _DONE = range(4)
+
+
+def iterate(matvec, b, *, rtol, max_steps, preconditioner, start) -> LinearSolution:
+    """`conjugate_gradients` without derivative, for use inside other solvers.
+
+    Every pass of the loop applies the operator once, to the iterate or to a direction,
+    so that a large operator is compiled once.
+    """
     goal = jnp.asarray(rtol, b.dtype) ** 2 * jnp.vdot(b, b)
     x = start(b)
-    r = b - matvec(x)
-    first = (x, r, jnp.zeros_like(b), jnp.ones((), b.dtype), jnp.vdot(r, r))
+    # Whatever p is, an infinite rz makes the first direction z itself.
+    big, none = jnp.full((), jnp.inf, b.dtype), jnp.int32(0)
+    first = _State(x, b, x, big, big, none, jnp.int32(_OPENING))
 
-    def going(state):
-        (*_, square), steps = state
-        return (square > goal) & (steps < max_steps)
+    def direction(state):
+        z = preconditioner(state.r)
+        rz = jnp.vdot(state.r, z)
+        return z + safe_divide(rz, state.rz) * state.p, rz
 
     def step(state):
-        (x, r, p, rz_before, _), steps = state
-        z = preconditioner(r)
-        rz = jnp.vdot(r, z)
-        # The first direction is z itself: p is zero there, whatever the factor.
-        p = z + safe_divide(rz, rz_before) * p
+        exact = state.phase != _ITERATING
+        at_iterate = lambda s: (s.x, s.rz)
+        p, rz = lax.cond(exact, at_iterate, direction, state)
         q = matvec(p)
         # A vanishing curvature means that the residual is rounding error already.
-        length = safe_divide(rz, jnp.vdot(p, q))
-        r = r - length * q
-        return (x + length * p, r, p, rz, jnp.vdot(r, r)), steps + 1
+        length = jnp.where(exact, 0, safe_divide(rz, jnp.vdot(p, q)))
+        r = jnp.where(exact, b, state.r) - jnp.where(exact, 1, length) * q
+        square, steps = jnp.vdot(r, r), state.steps + ~exact
+        more = (square > goal) & (steps < max_steps)
+        ended = jnp.where(exact & (steps == 0), _DONE, _CLOSING)
+        phase = jnp.where(more, _ITERATING, ended)
+        phase = jnp.where(state.phase == _CLOSING, _DONE, phase).astype(jnp.int32)
+        return _State(state.x + length * p, r, p, rz, square, steps, phase)
 
-    (x, *_), steps = lax.while_loop(going, step, (first, jnp.int32(0)))
-    r = b - matvec(x)
-    residual = jnp.sqrt(safe_divide(jnp.vdot(r, r), jnp.vdot(b, b)))
-    return x, (residual, steps)
+    end = lax.while_loop(lambda s: s.phase != _DONE, step, first)
+    residual = jnp.sqrt(safe_divide(end.square, jnp.vdot(b, b)))
+    converged = residual <= rtol
+    result = RESULTS.where(converged, RESULTS.successful, RESULTS.not_converged)
+    return LinearSolution(end.x, residual, end.steps, result)

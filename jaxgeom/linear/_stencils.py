@@ -6,6 +6,9 @@ form under XLA on the CPU (a convolution is a thousand times slower), provided t
 bounds are checked.
 """
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -16,6 +19,7 @@ def take(u: Float[Array, "x y z"], index: Int[Array, " n"], axis: int):
     return u.at[where].get(mode="promise_in_bounds")
 
 
+@partial(jax.jit, static_argnames="axis")
 def neighbors_along(u: Float[Array, "x y z"], axis: int):
     """The sum of both neighbors along an axis; the ends are their own neighbors."""
     n = u.shape[axis]
@@ -24,6 +28,7 @@ def neighbors_along(u: Float[Array, "x y z"], axis: int):
     return after + take(u, jnp.maximum(index - 1, 0), axis)
 
 
+@jax.jit
 def laplacian(
     u: Float[Array, "x y z"], coefficients: Float[Array, " 3"]
 ) -> Float[Array, "x y z"]:

@@ -7,6 +7,9 @@ its transpose. An axis of n nodes has ceil(n / 2) coarse ones. With a `token` th
 are kept apart (see `stage`), which is twice as fast on large grids.
 """
 
+from functools import partial
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -46,6 +49,7 @@ def restrict(
     return u
 
 
+@partial(jax.jit, static_argnames="n")
 def _interleaved(u, n):
     """P along the last axis, where gathers are slow: even and odd nodes apart."""
     last = u.shape[2] - 1
@@ -55,6 +59,7 @@ def _interleaved(u, n):
     return jnp.stack([even, odd], axis=-1).reshape(*u.shape[:2], -1)[..., :n]
 
 
+@partial(jax.jit, static_argnames=("axis", "n"))
 def _finer(u, axis, n):
     """P along one axis."""
     fine = np.arange(n)
@@ -63,6 +68,7 @@ def _finer(u, axis, n):
     return 0.75 * take(u, near, axis) + 0.25 * take(u, far, axis)
 
 
+@partial(jax.jit, static_argnames="axis")
 def _coarser(u, axis):
     """P^T along one axis."""
     n = u.shape[axis]

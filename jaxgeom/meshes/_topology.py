@@ -4,6 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._core import prefix_sum
 from ..shapes import TriangleMesh
 from ._edges import EdgeRuns, components, edge_runs
 from ._geometry import corners, doubled
@@ -135,20 +136,13 @@ def _run_counts(runs: EdgeRuns, faces):
     """
     e = runs.slots.shape[0]
     forward = faces.reshape(-1)[runs.slots] == runs.low
-    heads = jnp.where(runs.joins, 0, jnp.arange(e, dtype=jnp.int32))
-    run = jnp.where(runs.real, _running_maximum(heads), e)
-    size = jnp.zeros(e, jnp.int32).at[run].add(1, mode="drop")
+    heads = runs.real & ~runs.joins
+    number = prefix_sum(heads.astype(jnp.int32)) + heads - 1
+    run = jnp.where(runs.real, number, e)
+    total = lambda x: jnp.zeros(e, jnp.int32).at[run].add(x, mode="drop")
+    at_heads = lambda x: jnp.where(heads, x[number], 0)
     signs = jnp.where(forward, 1, -1).astype(jnp.int32)
-    return size, jnp.zeros(e, jnp.int32).at[run].add(signs, mode="drop")
-
-
-def _running_maximum(x):
-    """The largest of x[0], ..., x[i], by doubling (a few passes, no long scan)."""
-    step = 1
-    while step < x.shape[0]:
-        x = x.at[step:].max(x[:-step])
-        step *= 2
-    return x
+    return at_heads(total(1)), at_heads(total(signs))
 
 
 def _before(x):

@@ -102,12 +102,14 @@ def reconstruct(
         values, grid = _pad(values, grid, field.level)
     needed = _measure(extractor, values, field.level)
     capacity = Capacity.holding(*(int(n) for n in jax.tree.leaves(needed)))
-    cleaning = jnp.asarray([trim or 0.0, min_component], values.dtype)
-    mesh, check, status = _mesh(
-        *(field, values, grid, unit, extractor, capacity, closed, cleaning, token)
-    )
     if throw:
         _raise_without_surface(needed)
+    mesh, status = _mesh(field, (values, grid), unit, extractor, capacity, token)
+    check = _topology(mesh)
+    if not closed or int(check.num_components) > 1:
+        cleaning = jnp.asarray([trim or 0.0, min_component], values.dtype)
+        mesh = _clean(mesh, field.stats.area, *cleaning)
+        check = _topology(mesh)
     notes = ready.notes + _notes_on(field)
     mesh, field = _to_user(mesh.trim(), field, ready)
     result = first_failure(field.result, status)
@@ -201,18 +203,22 @@ def _measure(extractor, values, level):
 
 
 @eqx.filter_jit
-def _mesh(
-    field, values, grid, cloud, extractor, capacity, closed, cleaning, token
-) -> tuple[TriangleMesh, Topology, RESULTS]:
+def _mesh(field, samples, cloud, extractor, capacity, token):
+    values, grid = samples
     found = extractor(values, grid, field.level, capacity=capacity, token=token)
-    mesh = _with_attributes(found.mesh, field, cloud, token)
-    trim, min_component = cleaning
-    if not closed:
-        areas = jnp.where(field.stats.area > 0, field.stats.area, jnp.nan)
-        sparsest = trim / jnp.nanmedian(areas)
-        mesh = trim_by_attribute(mesh, mesh.attributes["density"], sparsest)
-    mesh = keep_faces(mesh, large_components(mesh, min_fraction=min_component))
-    return mesh, topology(mesh), found.result
+    return _with_attributes(found.mesh, field, cloud, token), found.result
+
+
+@eqx.filter_jit
+def _clean(mesh, areas, trim, min_component):
+    """The mesh without what lies in gaps of the scan (no trim: 0) and without specks."""
+    areas = jnp.where(areas > 0, areas, jnp.nan)
+    sparsest = jnp.where(trim > 0, trim / jnp.nanmedian(areas), -jnp.inf)
+    mesh = trim_by_attribute(mesh, mesh.attributes["density"], sparsest)
+    return keep_faces(mesh, large_components(mesh, min_fraction=min_component))
+
+
+_topology = eqx.filter_jit(topology)
 
 
 def _with_attributes(mesh, field, cloud, token):

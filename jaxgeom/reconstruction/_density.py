@@ -12,6 +12,7 @@ scan is too sparse for that kernel, the estimate of a coarser grid takes over.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -136,7 +137,7 @@ def _noise(q, normals, real, shape, around):
         total = interpolate(smooth(splat(weights * w, q, shape)), q)
         return (total - around.own * w) / around.others
 
-    mean = jnp.stack([mean_of_others(q[:, d] - center[d]) for d in range(3)], axis=-1)
+    mean = jax.vmap(mean_of_others, in_axes=1, out_axes=1)(q - center)
     offset = jnp.sum(normals * (q - center - mean), axis=-1)
     weights = weights * jnp.maximum(2 * around.trust - 1, 0.0)
     scatter = (2 * (offset - mean_of_others(offset))) ** 2

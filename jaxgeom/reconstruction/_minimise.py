@@ -19,6 +19,7 @@ from ..linear import (
     Multigrid,
     conjugate_gradients,
     interpolate,
+    iterate,
     laplacian,
     prolong,
     restrict,
@@ -101,7 +102,7 @@ def _coarse_to_fine(b, system: Callable, multigrid: Multigrid):
     if len(multigrid.diagonals) == 1:
         return multigrid.v_cycle(b)
     token = system.token
-    coarse = conjugate_gradients(
+    coarse = iterate(
         system.coarser(b.shape),
         restrict(b, token=token),
         rtol=0.0,
