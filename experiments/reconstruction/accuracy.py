@@ -4,8 +4,8 @@
 
 Every method gets the same points with its default settings and a grid of the same
 resolution. RMS: exact distances between samples of each surface and the other surface
-(by Open3D's ray casting scene), in thousandths of the longest side; CD: CD-L1 of 100 000
-samples on each (by scipy's k-d tree), which is about 1.9 for a surface and itself.
+(by Open3D's ray casting scene), in thousandths of the longest side; CD: CD-L1 of
+100 000 samples on each (by scipy's k-d tree), about 1.9 for a surface and itself.
 `--screening 2 8` adds rows with given screening weights.
 """
 

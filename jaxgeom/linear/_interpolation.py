@@ -102,7 +102,7 @@ def _flat_index(index, shape):
 
 
 def _cells(q, shape):
-    """The first nodes of the cells that hold the points, and where in them, per axis."""
+    """The first nodes of the cells that hold the points, and where in them."""
     bases, fractions = [], []
     for d, n in enumerate(shape):
         clamped = jnp.clip(q[:, d], 0, n - 1)

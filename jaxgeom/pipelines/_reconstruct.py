@@ -211,7 +211,7 @@ def _mesh(field, samples, cloud, extractor, capacity, token):
 
 @eqx.filter_jit
 def _clean(mesh, areas, trim, min_component):
-    """The mesh without what lies in gaps of the scan (no trim: 0) and without specks."""
+    """The mesh without what lies in gaps of the scan (0: keep all) and specks."""
     areas = jnp.where(areas > 0, areas, jnp.nan)
     sparsest = jnp.where(trim > 0, trim / jnp.nanmedian(areas), -jnp.inf)
     mesh = trim_by_attribute(mesh, mesh.attributes["density"], sparsest)
