@@ -18,6 +18,7 @@ _ROOMS = (
     "normals",
     "pipelines",
     "reconstruction",
+    "registration",
     "render",
     "shapes",
     "transforms",
