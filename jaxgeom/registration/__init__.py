@@ -7,3 +7,5 @@ from ._gnc import gnc as gnc
 from ._gnc import robust_procrustes as robust_procrustes
 from ._ransac import Consensus as Consensus
 from ._ransac import ransac as ransac
+from ._global import GlobalStart as GlobalStart
+from ._global import align_features as align_features

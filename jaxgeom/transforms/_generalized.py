@@ -88,12 +88,14 @@ def generalized_procrustes(
         real = real & mask
     problem = _Problem(jnp.where(real[..., None], shapes, 0), real, scaling, reflection)
     rtol = 64 * jnp.finfo(shapes.dtype).eps if rtol is None else rtol
-    mean, (steps, moved) = jax.lax.custom_root(
+    # The way to the fixed point has no part in its derivative.
+    still = jax.lax.stop_gradient(problem)
+    found, steps, moved = _alternate(still, _start(still), rtol, max_steps)
+    mean = jax.lax.custom_root(
         lambda mean: _advance(problem, mean) - mean,
-        jax.lax.stop_gradient(_start(problem)),
-        lambda _, mean: _alternate(problem, mean, rtol, max_steps),
+        found,
+        lambda _, found: found,
         partial(_solve_tangent, max_steps=max_steps),
-        has_aux=True,
     )
     return _finish(problem, mean, steps, moved <= rtol)
 
@@ -154,8 +156,7 @@ def _alternate(problem, mean, rtol, max_steps):
 
     going = lambda carry: (carry[1] < max_steps) & (carry[2] > rtol)
     start = (mean, jnp.zeros((), jnp.int32), jnp.full((), jnp.inf, mean.dtype))
-    mean, steps, change = jax.lax.while_loop(going, step, start)
-    return mean, (steps, change)
+    return jax.lax.while_loop(going, step, start)
 
 
 def _solve_tangent(operator, right, max_steps):
