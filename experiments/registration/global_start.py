@@ -37,7 +37,8 @@ def poses(folder):
         if line.startswith("bmesh"):
             _, name, *numbers = line.split()
             values = np.array(numbers, float)
-            turn = Rotation.from_quat(values[3:]).as_matrix()
+            # The published quaternions turn the other way.
+            turn = Rotation.from_quat(values[3:]).as_matrix().T
             found[name.removesuffix(".ply")] = (turn, values[:3])
     return found
 
@@ -60,7 +61,9 @@ def main():
     parser.add_argument("--voxel-size", type=float, default=0.004)
     parser.add_argument("--overlap", type=float, default=0.5)
     parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--only", type=int, default=None, help="the first so many pairs")
+    parser.add_argument(
+        "--only", type=int, default=None, help="the first so many pairs"
+    )
     args = parser.parse_args()
     folder = pathlib.Path(os.environ["JAXGEOM_DATA"]) / "registration/stanford_bunny"
     scans = np.load(folder / "bunny_scans.npz")

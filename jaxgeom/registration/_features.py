@@ -13,10 +13,12 @@ from .._core import (
     safe_norm,
     safe_normalize,
 )
-from ..neighbors import CellList, Neighbors, build, knn
+from ..neighbors import BruteForce, CellList, Neighbors, build, knn
 from ..shapes import PointCloud
 
 _BINS = 11
+# Below this many points comparing all is faster than lists of many neighbors.
+_FEW = 4096
 
 
 class Matches(eqx.Module):
@@ -66,7 +68,8 @@ def fpfh(
     washed = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, cloud.washed()))
     normals = safe_normalize(washed.normals)
     real = washed.mask & jnp.any(normals != 0, axis=1)
-    index = build(washed.points, real, backend=CellList(k + 1))
+    backend = BruteForce() if real.shape[0] <= _FEW else CellList(k + 1)
+    index = build(washed.points, real, backend=backend)
     near = knn(index, washed.points, k + 1, mask=real, max_distance=radius)
     itself = near.indices == jnp.arange(real.shape[0])[:, None]
     near = eqx.tree_at(lambda x: x.mask, near, near.mask & ~itself)
@@ -84,7 +87,7 @@ def _simple_histograms(points, normals, near: Neighbors):
     gap = [b - a for a, b in zip(here(points), there(points), strict=True)]
     angles, whole = _pair_angles(here(normals), there(normals), gap)
     use = near.mask & whole
-    percent = safe_divide(100.0, jnp.sum(near.mask, axis=1).astype(points.dtype))
+    percent = safe_divide(100.0, jnp.sum(use, axis=1).astype(points.dtype))
     counts = [_histogram(unit, use) for unit in angles]
     return jnp.concatenate(counts, axis=1) * percent[:, None]
 

@@ -14,6 +14,7 @@ from ._ransac import conclude, make_pairs, propose
 from ._thin import thin
 
 _FACING = 0.7
+_POLISHED = 4
 
 
 class GlobalStart(eqx.Module):
@@ -38,9 +39,9 @@ def align_features(
     *,
     voxel_size: Float[Array, ""] | float,
     key: Key[Array, ""],
-    capacity: int = 2048,
+    capacity: int = 4096,
     neighbors: int = 64,
-    draws: int = 262_144,
+    draws: int = 131_072,
     hypotheses: int = 2048,
     kept: int = 32,
     polish: int = 10,
@@ -49,9 +50,9 @@ def align_features(
     """A rough alignment of two scans, without a start.
 
     Both are thinned to one point per voxel, described by `fpfh` in balls of five
-    voxels, and matched. The `kept` best transforms of random samples of the matches
-    (see `ransac`, threshold 1.5 voxels) are polished by closest points with similar
-    normals, and the one that covers most of the source wins.
+    voxels, and matched. Of the `kept` best transforms of random samples of the matches
+    (see `ransac`, threshold 1.5 voxels) the four that cover most of the source are
+    polished by closest points with similar normals; the one that then covers most wins.
 
     **Arguments:**
 
@@ -62,7 +63,7 @@ def align_features(
     - `capacity`: room for thinned points, static.
     - `neighbors`: the most that a feature looks at.
     - `draws`, `hypotheses`: as in `ransac`.
-    - `polish`: closest-point steps of every kept transform.
+    - `polish`: closest-point steps of the four transforms.
     - `min_inliers`: fewer matches in agreement are no consensus.
 
     The result is `capacity_exceeded` where a thinned cloud does not fit, or
@@ -95,17 +96,23 @@ def _best_cover(source, target, guesses, threshold, polish):
     index = build(target.points, target.mask, backend=CellList(1))
     count = jnp.maximum(jnp.sum(source.mask), 1).astype(threshold.dtype)
 
+    def judged(guess):
+        square, use, _ = _cover(source, target, index, guess, threshold)
+        score = jnp.sum(jnp.where(use, threshold**2 - square, 0))
+        found = jnp.sum(use).astype(threshold.dtype)
+        total = jnp.sum(jnp.where(use, square, 0))
+        return score, found / count, jnp.sqrt(total / jnp.maximum(found, 1))
+
     def polished(guess):
         step = lambda _, guess: _closer(source, target, index, guess, threshold)
         guess = jax.lax.fori_loop(0, polish, step, guess)
-        square, use, _ = _cover(source, target, index, guess, threshold)
-        total = jnp.sum(jnp.where(use, square, 0))
-        score = jnp.sum(jnp.where(use, threshold**2 - square, 0))
-        found = jnp.sum(use).astype(threshold.dtype)
-        return guess, score, found / count, jnp.sqrt(total / jnp.maximum(found, 1))
+        return guess, *judged(guess)
 
     # One at a time: together every search would wait for the longest.
-    refined, score, fitness, rmse = jax.lax.map(polished, guesses)
+    score, _, _ = jax.lax.map(judged, guesses)
+    first = jax.lax.top_k(score, min(_POLISHED, score.shape[0]))[1]
+    some = jax.tree.map(lambda x: x[first], guesses)
+    refined, score, fitness, rmse = jax.lax.map(polished, some)
     best = jnp.argmax(score)
     return jax.tree.map(lambda x: x[best], (refined, fitness, rmse))
 
@@ -120,9 +127,7 @@ def _closer(source, target, index, guess, threshold):
 
 def _cover(source, target, index, guess, threshold):
     """Squared distances to the nearest target points, where these count, and which."""
-    near = knn(
-        index, guess(source.points), 1, mask=source.mask, max_distance=threshold
-    )
+    near = knn(index, guess(source.points), 1, mask=source.mask, max_distance=threshold)
     found = near.mask[:, 0]
     there = jnp.where(found, near.indices[:, 0], 0)
     facing = jnp.sum(guess.normals(source.normals) * target.normals[there], axis=1)

@@ -33,8 +33,8 @@ def thin(
     rows = jnp.concatenate(
         [offset, jnp.where(mask[:, None], normals, 0), mask[:, None]], axis=1
     )
-    total = jnp.zeros((capacity, 7), points.dtype).at[slot].add(
-        rows[order], mode="drop"
+    total = (
+        jnp.zeros((capacity, 7), points.dtype).at[slot].add(rows[order], mode="drop")
     )
     real = jnp.arange(capacity) < jnp.sum(new)
     mean = low + safe_divide(total[:, :3], total[:, 6:])
