@@ -13,6 +13,7 @@ class RESULTS(optx.RESULTS):
     zero_normals = "Some normals are zero or not finite: these points were ignored."
     outside_grid = "Some points lie outside the grid: these points were ignored."
     no_surface = "The level set does not meet the grid: there is no surface."
+    no_consensus = "Too few pairs of points agree on one transform."
     not_converged = "The solver stopped before the residual fell below rtol."
 
 

@@ -1,7 +1,8 @@
 """The three groups of maps: rigid (6 parameters), similarity (7), affine (12).
 
-Every transform acts on points as x' = M x + t, on normals as the inverse transpose of
-M (normalised), composes right to left with `@`, and is named after both its ends:
+In the plane they have 3, 4 and 6; beyond space they have no exponential map. Every
+transform acts on points as x' = M x + t, on normals as the inverse transpose of M
+(normalised), composes right to left with `@`, and is named after both its ends:
 `target_from_source`.
 """
 
@@ -15,22 +16,22 @@ from jaxtyping import Array, Float
 
 from .._core import GeometryError, message, safe_normalize
 from ..shapes import PointCloud, TriangleMesh
-from ._rotations import cross_matrix, rotation_exp, rotation_log
+from ._rotations import left_jacobian, rotation_exp, rotation_log, skew_matrix
 
 
 class AbstractTransform(eqx.Module):
-    """A map x' = M x + t of space."""
+    """A map x' = M x + t of space (d = 3), of the plane or of any dimension d."""
 
     @abstractmethod
-    def linear(self) -> Float[Array, "3 3"]:
+    def linear(self) -> Float[Array, "d d"]:
         """The matrix M."""
 
     @abstractmethod
-    def shift(self) -> Float[Array, " 3"]:
+    def shift(self) -> Float[Array, " d"]:
         """The vector t."""
 
     def __call__(self, shape):
-        """The image of points [..., 3], a `PointCloud` or a `TriangleMesh`."""
+        """The image of points [..., d], a `PointCloud` or a `TriangleMesh`."""
         if isinstance(shape, PointCloud):
             return self._move(shape, lambda cloud: (cloud.points, cloud.normals))
         if isinstance(shape, TriangleMesh):
@@ -45,44 +46,46 @@ class AbstractTransform(eqx.Module):
         )
         return eqx.tree_at(where, shape, moved, is_leaf=lambda x: x is None)
 
-    def points(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    def points(self, points: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """M x + t for every point."""
         return points @ self.linear().T + self.shift()
 
-    def normals(self, normals: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    def normals(self, normals: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The unit normals of the moved surface: M^-T n, normalised."""
         return safe_normalize(normals @ jnp.linalg.inv(self.linear()))
 
-    def matrix(self) -> Float[Array, "4 4"]:
+    def matrix(self) -> Float[Array, "d+1 d+1"]:
         """The homogeneous matrix [[M, t], [0, 1]]."""
         top = jnp.concatenate([self.linear(), self.shift()[:, None]], axis=1)
-        return jnp.concatenate([top, jnp.eye(4, dtype=top.dtype)[3:]])
+        return jnp.concatenate([top, jnp.eye(top.shape[1], dtype=top.dtype)[-1:]])
 
 
 class Rigid(AbstractTransform):
-    """x' = R x + t, with R a rotation [3, 3] and t [3] in the unit of the points."""
+    """x' = R x + t, with R a rotation [d, d] and t [d] in the unit of the points."""
 
-    rotation: Float[Array, "3 3"]
-    translation: Float[Array, " 3"]
+    rotation: Float[Array, "d d"]
+    translation: Float[Array, " d"]
 
     @staticmethod
-    def identity(dtype=None) -> "Rigid":
+    def identity(dtype=None, *, dimension: int = 3) -> "Rigid":
         """The map that moves nothing."""
-        return Rigid(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype))
+        return Rigid(jnp.eye(dimension, dtype=dtype), jnp.zeros(dimension, dtype))
 
     @staticmethod
     def exp(twist: Float[Array, " 6"]) -> "Rigid":
         """The motion of a twist (rotation vector in radians, then velocity).
 
         R = exp([w]x), t = V(w) v with V = I + b [w]x + c [w]x^2 (the left Jacobian).
+        In the plane a twist is an angle and a velocity, [3].
         """
-        w, v = twist[:3], twist[3:]
-        return Rigid(rotation_exp(w), _left_jacobian(w) @ v)
+        d = _dimension(twist, {3: 2, 6: 3})
+        w, v = twist[:-d], twist[-d:]
+        return Rigid(rotation_exp(w), left_jacobian(w) @ v)
 
     def log(self) -> Float[Array, " 6"]:
         """The twist whose `exp` this is; rotation angle at most pi."""
         w = rotation_log(self.rotation)
-        v = jnp.linalg.solve(_left_jacobian(w), self.translation)
+        v = jnp.linalg.solve(left_jacobian(w), self.translation)
         return jnp.concatenate([w, v])
 
     def linear(self):
@@ -102,38 +105,39 @@ class Rigid(AbstractTransform):
 
 
 class Similarity(AbstractTransform):
-    """x' = s R x + t, with s > 0 a scalar, R a rotation [3, 3], t [3]."""
+    """x' = s R x + t, with s > 0 a scalar, R a rotation [d, d], t [d]."""
 
     scale: Float[Array, ""]
-    rotation: Float[Array, "3 3"]
-    translation: Float[Array, " 3"]
+    rotation: Float[Array, "d d"]
+    translation: Float[Array, " d"]
 
     @staticmethod
-    def identity(dtype=None) -> "Similarity":
+    def identity(dtype=None, *, dimension: int = 3) -> "Similarity":
         """The map that moves nothing."""
-        return Similarity(
-            jnp.ones((), dtype), jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype)
-        )
+        rigid = Rigid.identity(dtype, dimension=dimension)
+        return Similarity(jnp.ones((), dtype), rigid.rotation, rigid.translation)
 
     @staticmethod
     def exp(tangent: Float[Array, " 7"]) -> "Similarity":
         """The map of a tangent vector (rotation vector, velocity, log of the scale).
 
-        The matrix exponential of [[log s I + [w]x, v], [0, 0]].
+        The matrix exponential of [[log s I + [w]x, v], [0, 0]]. In the plane a tangent
+        vector is an angle, a velocity and the log of the scale, [4].
         """
-        generator = tangent[6] * jnp.eye(3, dtype=tangent.dtype) + cross_matrix(
-            tangent[:3]
-        )
-        matrix = _expm(generator, tangent[3:6])
-        return Similarity(jnp.exp(tangent[6]), rotation_exp(tangent[:3]), matrix[:3, 3])
+        d = _dimension(tangent, {4: 2, 7: 3})
+        w, v, log_scale = tangent[: -d - 1], tangent[-d - 1 : -1], tangent[-1]
+        generator = log_scale * jnp.eye(d, dtype=w.dtype) + skew_matrix(w)
+        matrix = _expm(generator, v)
+        return Similarity(jnp.exp(log_scale), rotation_exp(w), matrix[:d, d])
 
     def log(self) -> Float[Array, " 7"]:
-        """The tangent vector whose `exp` this is."""
+        """The tangent vector whose `exp` this is; rotation angle at most pi."""
         w = rotation_log(self.rotation)
         log_scale = jnp.log(self.scale)
-        generator = log_scale * jnp.eye(3, dtype=w.dtype) + cross_matrix(w)
+        eye = jnp.eye(self.translation.shape[0], dtype=w.dtype)
+        generator = log_scale * eye + skew_matrix(w)
         # t = (integral of exp(u G) du) v, and expm of a block matrix is that integral.
-        columns = [_expm(generator, e)[:3, 3] for e in jnp.eye(3, dtype=w.dtype)]
+        columns = [_expm(generator, e)[:-1, -1] for e in eye]
         v = jnp.linalg.solve(jnp.stack(columns, axis=1), self.translation)
         return jnp.concatenate([w, v, log_scale[None]])
 
@@ -158,15 +162,15 @@ class Similarity(AbstractTransform):
 
 
 class Affine(AbstractTransform):
-    """x' = M x + t, with M any matrix [3, 3]."""
+    """x' = M x + t, with M any matrix [d, d]."""
 
-    coefficients: Float[Array, "3 3"]
-    translation: Float[Array, " 3"]
+    coefficients: Float[Array, "d d"]
+    translation: Float[Array, " d"]
 
     @staticmethod
-    def identity(dtype=None) -> "Affine":
+    def identity(dtype=None, *, dimension: int = 3) -> "Affine":
         """The map that moves nothing."""
-        return Affine(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype))
+        return Affine(jnp.eye(dimension, dtype=dtype), jnp.zeros(dimension, dtype))
 
     @staticmethod
     def of(transform: AbstractTransform) -> "Affine":
@@ -175,9 +179,13 @@ class Affine(AbstractTransform):
 
     @staticmethod
     def exp(tangent: Float[Array, " 12"]) -> "Affine":
-        """The map of a generator (its 3 x 3 matrix by rows, then velocity)."""
-        matrix = _expm(tangent[:9].reshape(3, 3), tangent[9:])
-        return Affine(matrix[:3, :3], matrix[:3, 3])
+        """The map of a generator (its matrix by rows, then velocity).
+
+        [12] in space, [6] in the plane.
+        """
+        d = _dimension(tangent, {6: 2, 12: 3})
+        matrix = _expm(tangent[:-d].reshape(d, d), tangent[-d:])
+        return Affine(matrix[:d, :d], matrix[:d, d])
 
     def log(self) -> Float[Array, " 12"]:
         """The generator whose `exp` this is (host: scipy; M without eigenvalues <= 0).
@@ -196,7 +204,7 @@ class Affine(AbstractTransform):
                 )
             )
         real = jnp.asarray(np.real(generator), self.translation.dtype)
-        return jnp.concatenate([real[:3, :3].reshape(9), real[:3, 3]])
+        return jnp.concatenate([real[:-1, :-1].reshape(-1), real[:-1, -1]])
 
     def linear(self):
         return self.coefficients
@@ -214,21 +222,22 @@ class Affine(AbstractTransform):
         return Affine(back, -back @ self.translation)
 
 
+def _dimension(tangent, sizes: dict[int, int]) -> int:
+    """The dimension of the space whose group has tangent vectors of this size."""
+    if tangent.ndim != 1 or tangent.shape[0] not in sizes:
+        wanted = " or ".join(f"[{size}]" for size in sizes)
+        raise GeometryError(
+            message(
+                f"a tangent vector must have shape {wanted}",
+                f"shape {tangent.shape}",
+                "Pass one vector at a time and batch with jax.vmap.",
+            )
+        )
+    return sizes[tangent.shape[0]]
+
+
 def _expm(generator, velocity):
     """The matrix exponential of [[G, v], [0, 0]]."""
-    block = jnp.zeros((4, 4), generator.dtype)
-    return jsl.expm(block.at[:3, :3].set(generator).at[:3, 3].set(velocity))
-
-
-def _left_jacobian(w):
-    """V = I + (1 - cos t)/t^2 [w]x + (t - sin t)/t^3 [w]x^2 with t = |w|."""
-    square = jnp.dot(w, w)
-    small = square < jnp.finfo(w.dtype).eps ** 0.5
-    safe = jnp.where(small, 1.0, square)
-    angle = jnp.sqrt(safe)
-    b_large = 2 * jnp.sin(angle / 2) ** 2 / safe
-    b = jnp.where(small, 0.5 - square / 24 + square**2 / 720, b_large)
-    c_large = (angle - jnp.sin(angle)) / (safe * angle)
-    c = jnp.where(small, 1 / 6 - square / 120 + square**2 / 5040, c_large)
-    k = cross_matrix(w)
-    return jnp.eye(3, dtype=w.dtype) + b * k + c * (k @ k)
+    d = generator.shape[0]
+    block = jnp.zeros((d + 1, d + 1), generator.dtype)
+    return jsl.expm(block.at[:d, :d].set(generator).at[:d, d].set(velocity))

@@ -15,7 +15,7 @@ FLOORS = [
     {"shapes", "transforms"},
     {"neighbors", "linear"},
     {"fields", "meshes"},
-    {"isosurface", "reconstruction", "normals"},
+    {"isosurface", "reconstruction", "registration", "normals"},
     {"pipelines"},
     {"io", "render"},
     {"cli"},

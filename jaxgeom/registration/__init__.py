@@ -1,0 +1,11 @@
+"""Alignment of point clouds: features, matching, and consensus among wrong pairs."""
+
+from ._features import Matches as Matches
+from ._features import fpfh as fpfh
+from ._features import match_features as match_features
+from ._global import GlobalStart as GlobalStart
+from ._global import align_features as align_features
+from ._gnc import gnc as gnc
+from ._gnc import robust_procrustes as robust_procrustes
+from ._ransac import Consensus as Consensus
+from ._ransac import ransac as ransac
