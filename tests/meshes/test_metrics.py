@@ -168,7 +168,7 @@ def test_evaluation_of_concentric_spheres():
     assert e.rms_from_reference == pytest.approx(0.05, rel=0.02)
     assert e.rms == pytest.approx(0.05, rel=0.02)
     assert 0.049 <= e.hausdorff < 0.052
-    assert e.chamfer == pytest.approx((e.accuracy + e.completeness) / 2, rel=1e-6)
+    assert e.chamfer == pytest.approx(float(e.accuracy + e.completeness) / 2, rel=1e-6)
     assert e.chamfer > e.rms
     assert e.f_score < 0.01
     assert e.normal_consistency > 0.97
