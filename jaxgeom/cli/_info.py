@@ -2,19 +2,26 @@
 
 import numpy as np
 
+from .. import PointCloud
 from ..io import load_cloud
+from ..meshes import topology
 from ..pipelines import memory_needed
+from ._files import load_shape
 from ._main import OK
 from ._report import say
 
 
 def run(arguments) -> int:
     """Print counts, bounds, and what a reconstruction would need."""
-    cloud = load_cloud(arguments.input)
-    points = np.asarray(cloud.points, np.float64)
+    shape = load_shape(arguments.input)
+    mesh = None if isinstance(shape, PointCloud) else shape
+    cloud = load_cloud(arguments.input) if mesh is not None else shape
+    points, precision = np.asarray(cloud.points, np.float64), cloud.points.dtype.name
     finite = np.isfinite(points).all(axis=1)
-    say(f"{arguments.input}: {len(points)} points, {points.dtype.name} on reading")
+    say(f"{arguments.input}: {len(points)} points, {precision}")
     say(f"  carries: {_carried(cloud)}")
+    if mesh is not None:
+        say(f"  mesh: {_mesh_line(mesh)}")
     if (~finite).any():
         say(f"  NaN or infinite: {(~finite).sum()} points")
     if finite.any():
@@ -26,6 +33,12 @@ def run(arguments) -> int:
     needs = ", ".join(f"{n}^3 {memory_needed(n) / 2**30:.2g} GiB" for n in sizes)
     say(f"  memory to reconstruct, at most: {needs}")
     return OK
+
+
+def _mesh_line(mesh):
+    check = topology(mesh)
+    state = "watertight" if check.is_closed & check.is_manifold else "open"
+    return f"{len(mesh.faces)} faces, {state}, {int(check.num_components)} bodies"
 
 
 def _carried(cloud):

@@ -1,7 +1,8 @@
 """`jaxgeom render FILE -o PICTURE`."""
 
-from ..io import FileError, load_cloud, load_mesh
+from .. import PointCloud
 from ..render import Camera, render_cloud, render_mesh, save_png
+from ._files import load_shape
 from ._main import OK
 from ._report import say
 
@@ -10,13 +11,11 @@ def run(arguments) -> int:
     """Draw a mesh, or the points of a file without faces."""
     size = (arguments.size, arguments.size)
     view = {"azimuth": arguments.azimuth, "elevation": arguments.elevation}
-    try:
-        mesh = load_mesh(arguments.input)
-    except FileError:
-        cloud = load_cloud(arguments.input)
-        image = render_cloud(cloud, Camera.around(cloud.points, **view), size=size)
+    shape = load_shape(arguments.input)
+    if isinstance(shape, PointCloud):
+        image = render_cloud(shape, Camera.around(shape.points, **view), size=size)
     else:
-        image = render_mesh(mesh, Camera.around(mesh.vertices, **view), size=size)
+        image = render_mesh(shape, Camera.around(shape.vertices, **view), size=size)
     save_png(arguments.output, image)
     say(f"wrote {arguments.output}")
     return OK

@@ -6,6 +6,7 @@ import os
 import pathlib
 import platform
 import sys
+import threading
 import time
 
 import jax
@@ -13,9 +14,11 @@ import numpy as np
 
 from .. import RESULTS, Reconstruction, __version__
 
+_PATIENCE = 2.0  # seconds of silence before a stage says that it is at work
+
 
 class Stages:
-    """Times the stages of a run; a stage that takes over two seconds is announced."""
+    """Times the stages of a run; one that takes over two seconds says so meanwhile."""
 
     def __init__(self):
         self.seconds: dict[str, float] = {}
@@ -24,10 +27,20 @@ class Stages:
     def stage(self, name: str):
         """Time one stage under its name."""
         start = time.perf_counter()
-        yield
+        progress = threading.Timer(_PATIENCE, _tell, (f"{name} ...",))
+        progress.daemon = True
+        progress.start()
+        try:
+            yield
+        finally:
+            progress.cancel()
         self.seconds[name] = round(time.perf_counter() - start, 3)
-        if self.seconds[name] > 2:
-            print(f"jaxgeom: {name}: {self.seconds[name]:.1f} s", file=sys.stderr)
+        if self.seconds[name] > _PATIENCE:
+            _tell(f"{name}: {self.seconds[name]:.1f} s")
+
+
+def _tell(text: str) -> None:
+    print(f"jaxgeom: {text}", file=sys.stderr, flush=True)
 
 
 def mesh_facts(out: Reconstruction) -> dict:

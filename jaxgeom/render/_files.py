@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from .._core import GeometryError, message
-from ..shapes import TriangleMesh
+from ..shapes import PointCloud, TriangleMesh
 
 _GREY = (236, 238, 242)
 
@@ -58,16 +58,22 @@ def side_by_side(images: Sequence[np.ndarray], *, gap: int = 8) -> np.ndarray:
     return row
 
 
-def save_html(path, mesh: TriangleMesh) -> pathlib.Path:
-    """Write a page that shows the mesh, to turn and to zoom; returns the path.
+def save_html(path, shape: TriangleMesh | PointCloud) -> pathlib.Path:
+    """Write a page that shows a mesh or a cloud, to turn and zoom; returns the path.
 
-    One file of about 0.7 MB beside the mesh, with everything inside: it needs a browser
+    One file of about 0.7 MB beside the data, with everything inside: it needs a browser
     and no network (the viewer is trimesh's). Coordinates are stored in float32.
     """
-    import trimesh
     from trimesh.viewer.notebook import scene_to_html
 
-    mesh = mesh.trim()
+    mesh = isinstance(shape, TriangleMesh)
+    body = _mesh_body(shape.trim()) if mesh else _cloud_body(shape)
+    return _write(path, scene_to_html(body.scene()).encode())
+
+
+def _mesh_body(mesh):
+    import trimesh
+
     normals = None if mesh.normals is None else np.asarray(mesh.normals)
     body = trimesh.Trimesh(
         np.asarray(mesh.vertices),
@@ -75,14 +81,22 @@ def save_html(path, mesh: TriangleMesh) -> pathlib.Path:
         vertex_normals=normals,
         process=False,
     )
-    body.visual.vertex_colors = _colors(mesh)
-    return _write(path, scene_to_html(body.scene()).encode())
+    body.visual.vertex_colors = _colors(mesh.attributes, len(mesh.vertices))
+    return body
 
 
-def _colors(mesh):
-    v = len(mesh.vertices)
-    colors = mesh.attributes.get("colors", np.broadcast_to((0.80, 0.69, 0.58), (v, 3)))
-    return np.round(255 * np.clip(np.asarray(colors)[:, :3], 0, 1)).astype(np.uint8)
+def _cloud_body(cloud):
+    import trimesh
+
+    real = np.asarray(cloud.mask)
+    colors = _colors(cloud.attributes, len(real))
+    return trimesh.PointCloud(np.asarray(cloud.points)[real], colors[real])
+
+
+def _colors(attributes, count):
+    clay = np.broadcast_to((0.80, 0.69, 0.58), (count, 3))
+    colors = np.asarray(attributes.get("colors", clay))[:, :3]
+    return np.round(255 * np.clip(colors, 0, 1)).astype(np.uint8)
 
 
 def _png(image):
