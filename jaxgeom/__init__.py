@@ -37,6 +37,8 @@ _NAMES = {
     "procrustes": "transforms",
     "generalized_procrustes": "transforms",
     "interpolate": "transforms",
+    "Fusion": "pipelines",
+    "fuse": "pipelines",
     "Reconstruction": "pipelines",
     "reconstruct": "pipelines",
     "reconstruct_jit": "pipelines",

@@ -30,7 +30,9 @@ import cases
 def ours(case, screening=None):
     """The door with its defaults (or a given screening weight)."""
     method = None if screening is None else ScreenedPoisson(screening=screening)
-    out = jg.reconstruct(case.cloud, resolution=2**case.depth, method=method)
+    out = jg.reconstruct(
+        case.cloud, resolution=2**case.depth, method=method, trim=case.trim
+    )
     stats = out.stats
     note = f"alpha {float(stats.screening):.2f} noise {float(stats.noise):.1e}"
     return out.mesh, f"{note} steps {int(stats.steps)}"
@@ -111,7 +113,8 @@ def row(case, name, method):
     closed = bool(facts.is_closed & facts.is_manifold)
     text += (
         f" euler {int(facts.euler):4d} bodies {int(facts.num_components)}"
-        f" {'closed' if closed else 'OPEN'} {seconds:.1f} s {note}"
+        f" {'closed' if closed else 'open'} loops {int(facts.boundary_loops)}"
+        f" {seconds:.1f} s {note}"
     )
     print(text, flush=True)
 

@@ -24,6 +24,7 @@ class Case:
     truth: TriangleMesh | None
     depth: int
     euler: int | None = None
+    trim: float | None = None
 
 
 def load(folder: str, names: list[str]):
@@ -40,7 +41,7 @@ def _unit(mesh):
     return TriangleMesh(unit, np.asarray(mesh.faces)), center, side
 
 
-def _sampled(name, shape, num, depth, euler, noise=0.0):
+def _sampled(name, shape, num, depth, euler, noise=0.0, trim=None):
     def make(folder):
         mesh, _, _ = _unit(load_mesh(folder / "meshes" / f"{shape}.ply"))
         drawn = sample_surface(mesh, num, key=jax.random.key(0))
@@ -50,7 +51,7 @@ def _sampled(name, shape, num, depth, euler, noise=0.0):
         normals = np.asarray(drawn.normals) + 20 * noise * rng.normal(size=(num, 3))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         cloud = PointCloud(points.astype(np.float32), normals.astype(np.float32))
-        return Case(name, cloud, mesh, depth, euler)
+        return Case(name, cloud, mesh, depth, euler, trim)
 
     return make
 
@@ -77,5 +78,6 @@ CASES = {
     "horse": _sampled("horse", "horse", 50_000, 7, 2),
     "bunny": _sampled("bunny", "bunny", 50_000, 7, 2),
     "fertility": _sampled("fertility", "fertility", 50_000, 7, -6),
+    "falcon-open": _sampled("falcon-open", "falcon_open", 50_000, 7, 1, 0.0, 0.3),
     "statue-200": _sampled("statue-200", "nefertiti", 200, 6, 2),
 }

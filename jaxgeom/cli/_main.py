@@ -69,6 +69,7 @@ def _parser():
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_demo(commands)
     _add_reconstruct(commands)
+    _add_fuse(commands)
     _add_info(commands)
     _add_pictures(commands)
     for command in commands.choices.values():
@@ -92,6 +93,13 @@ def _add_reconstruct(commands):
         "reconstruct", help="a watertight mesh from a point cloud"
     )
     command.add_argument("input", metavar="SCAN", help="ply, xyz, csv, npz, pcd, ...")
+    command.add_argument("--ignore-normals", action="store_true", help="estimate them")
+    command.add_argument("--flip-normals", action="store_true")
+    _add_surface(command)
+
+
+def _add_surface(command):
+    """The options of every command that makes a mesh."""
     command.add_argument("-o", "--output", required=True, metavar="MESH")
     size = command.add_mutually_exclusive_group()
     size.add_argument("--resolution", type=_resolution, metavar="N", help="nodes (128)")
@@ -121,9 +129,30 @@ def _add_reconstruct(commands):
         metavar="F",
         help="drop bodies below this share of the largest (0.01; 0 keeps all)",
     )
-    command.add_argument("--ignore-normals", action="store_true", help="estimate them")
-    command.add_argument("--flip-normals", action="store_true")
     command.add_argument("--report", metavar="JSON", help="parameters, sizes, statuses")
+
+
+def _add_fuse(commands):
+    command = commands.add_parser(
+        "fuse", help="align several scans of one object and make one mesh of them"
+    )
+    command.add_argument("inputs", nargs="+", metavar="SCAN", help="two or more files")
+    command.add_argument(
+        "--viewpoint",
+        type=float,
+        nargs=3,
+        metavar=("X", "Y", "Z"),
+        help="the scanner, in the frame of every scan (default: not known)",
+    )
+    command.add_argument(
+        "--voxel-size",
+        type=_positive,
+        metavar="V",
+        help="of the finest level, in the unit of the points (1/160 of a scan)",
+    )
+    command.add_argument("--seed", type=int, default=0)
+    command.add_argument("--poses", metavar="JSON", help="write T_world_scan here")
+    _add_surface(command)
 
 
 def _add_info(commands):
@@ -158,4 +187,5 @@ def _number(kind, low, high, what):
 _resolution = _number(int, 8, 4096, "a whole number from 8 to 4096")
 _depth = _number(int, 3, 12, "a whole number from 3 to 12")
 _nonnegative = _number(float, 0.0, 1e9, "a number of at least 0")
+_positive = _number(float, 1e-12, 1e12, "a number above 0")
 _scale = _number(float, 1.01, 10.0, "a number from 1.01 to 10")

@@ -1,5 +1,7 @@
 """The doors: whole pipelines, in a host form and a compiled form."""
 
+from ._fuse import Fusion as Fusion
+from ._fuse import fuse as fuse
 from ._memory import memory_needed as memory_needed
 from ._prepare import prepare as prepare
 from ._reconstruct import Reconstruction as Reconstruction

@@ -47,7 +47,7 @@ def prepare(cloud, *, weights=None) -> Prepared:
     keep = np.asarray(cloud.mask)
     weights = None if weights is None else weights[keep]
     cloud = cloud.trim()
-    _check_points(cloud.points)
+    check_points(cloud.points)
     points = np.asarray(cloud.points, np.float64)
     low, high = points.min(axis=0), points.max(axis=0)
     center, scale = (low + high) / 2, float((high - low).max())
@@ -92,7 +92,8 @@ def _cast(normals, dtype):
     return None if normals is None else np.asarray(normals).astype(dtype)
 
 
-def _check_points(points):
+def check_points(points) -> None:
+    """Raise `GeometryError` for too few points, or points that are not finite."""
     if points.shape[0] < _FEWEST:
         raise GeometryError(
             message(

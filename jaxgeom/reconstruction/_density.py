@@ -112,8 +112,9 @@ def at_level(q, shape, level):
 
 def _neighborhood(q, total, level) -> _Neighborhood:
     own = _own_weight(q)
-    # A sample alone still has rounding error for company: at most 1e4 cells of area.
-    others = jnp.maximum(interpolate(total, q) - own, 1e-4 * own)
+    # A stray sample far from all others stands for a few coarse cells at most: with
+    # the area that its loneliness suggests it would outweigh the whole scan.
+    others = jnp.maximum(interpolate(total, q) - own, own)
     density = (2 * jnp.pi) ** 0.5 * _WIDTH * others
     return _Neighborhood(own, others, 4.0**level / density, _trust(density))
 

@@ -15,6 +15,9 @@ from ._thin import thin
 
 _FACING = 0.7
 _POLISHED = 4
+# In voxels: the ball that a feature describes, and the distance of a right pair.
+_RADIUS = 5.0
+_THRESHOLD = 1.5
 
 
 class GlobalStart(eqx.Module):
@@ -70,22 +73,77 @@ def align_features(
     `too_few_points` or `no_consensus`. A rough alignment is a discrete choice: it is a
     constant under differentiation. Raises `GeometryError` for clouds without normals.
     """
-    _check_normals(source, target)
-    source, target = jax.lax.stop_gradient((source, target))
-    source, need_source = thin(source, voxel_size, capacity)
-    target, need_target = thin(target, voxel_size, capacity)
-    radius = 5 * jnp.asarray(voxel_size, source.points.dtype)
-    looks = [fpfh(c, radius=radius, k=neighbors) for c in (source, target)]
+    describe = lambda cloud: describe_view(
+        cloud, voxel_size=voxel_size, capacity=capacity, neighbors=neighbors
+    )
+    return align_views(
+        describe(source),
+        describe(target),
+        key=key,
+        draws=draws,
+        hypotheses=hypotheses,
+        kept=kept,
+        polish=polish,
+        min_inliers=min_inliers,
+    )
+
+
+class View(eqx.Module):
+    """A thinned scan with the features of its points, ready to be matched.
+
+    `required` is the number of voxels that the scan occupies, `voxel_size` their side.
+    """
+
+    cloud: PointCloud
+    features: Float[Array, "n 33"]
+    required: Int[Array, ""]
+    voxel_size: Float[Array, ""]
+
+
+def describe_view(
+    cloud: PointCloud,
+    *,
+    voxel_size: Float[Array, ""] | float,
+    capacity: int = 4096,
+    neighbors: int = 64,
+) -> View:
+    """What `align_views` needs of one scan; arguments as in `align_features`.
+
+    Raises `GeometryError` for a cloud without normals.
+    """
+    _check_normals(cloud)
+    size = jnp.asarray(voxel_size, cloud.points.dtype)
+    thinned, required = thin(jax.lax.stop_gradient(cloud), size, capacity)
+    look = fpfh(thinned, radius=_RADIUS * size, k=neighbors)
+    return View(thinned, look, required, size)
+
+
+def align_views(
+    source: View,
+    target: View,
+    *,
+    key: Key[Array, ""],
+    draws: int = 131_072,
+    hypotheses: int = 2048,
+    kept: int = 32,
+    polish: int = 10,
+    min_inliers: int = 8,
+) -> GlobalStart:
+    """`align_features` for scans that are described already."""
+    views = jax.lax.stop_gradient((source, target))
+    source, target = (view.cloud for view in views)
+    looks = [view.features for view in views]
     matches = match_features(*looks, source_mask=source.mask, target_mask=target.mask)
     there = target.points.at[matches.indices].get(mode="fill", fill_value=0)
-    threshold = 0.3 * radius
+    threshold = _THRESHOLD * views[0].voxel_size
     pairs = make_pairs(source.points, there, matches.mask, threshold)
     guesses, _ = propose(pairs, key, False, draws, hypotheses, kept)
     best, fitness, rmse = _best_cover(source, target, guesses, threshold, polish)
     agreed = conclude(pairs, best, False, min_inliers)
-    overflow = jnp.maximum(need_source, need_target) > capacity
+    overflow = [v.required > v.cloud.mask.shape[0] for v in views]
     result = first_failure(
-        failure_where(overflow, RESULTS.capacity_exceeded), agreed.result
+        failure_where(overflow[0] | overflow[1], RESULTS.capacity_exceeded),
+        agreed.result,
     )
     count = jnp.sum(matches.mask)
     return GlobalStart(best, count, agreed.num_inliers, fitness, rmse, result)
