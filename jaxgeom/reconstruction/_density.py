@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .._core import stage
 from ..linear import coarse_shape, interpolate, prolong, smooth, splat
 
 # Standard deviation of the kernel in spacings of the grid that it lives on.
@@ -47,6 +48,7 @@ def sample_geometry(
     shape: tuple[int, int, int],
     *,
     levels: int = 0,
+    token: Bool[Array, ""] | None = None,
 ) -> SampleGeometry:
     """The area and the noise of samples at node indices q of a grid of `shape`.
 
@@ -55,6 +57,7 @@ def sample_geometry(
     - `normals`: [n, 3], unit; `real`: [n], False for padding.
     - `levels`: how many grids beyond the first, each twice as coarse, the density is
       estimated on. The finest that holds enough samples around a point serves it.
+    - `token`: see `jaxgeom._core.stage`.
 
     The noise is the scatter of n . (x - m) about its local mean, where m is the mean of
     the samples in the kernel: a plane gives 0, so does constant curvature.
@@ -62,11 +65,12 @@ def sample_geometry(
     area = density = None
     for level in reversed(range(1, levels + 2)):
         coarse, grid_shape = at_level(q, shape, level)
-        total = smooth(splat(real.astype(q.dtype), coarse, grid_shape))
+        count = splat(real.astype(q.dtype), coarse, grid_shape)
+        total = smooth(count, token=token)
         here = _neighborhood(coarse, total, level)
         area = here.area if area is None else _blend(here.trust, here.area, area)
-        density = _density(total, level, density)
-    noise = _noise(coarse, normals, real, grid_shape, here)
+        density = _density(total, level, density, token)
+    noise = _noise(coarse, normals, real, grid_shape, here, token)
     return SampleGeometry(jnp.where(real, area, 0.0), density, noise)
 
 
@@ -88,14 +92,19 @@ def _blend(trust, here, coarser):
     return trust * here + (1 - trust) * coarser
 
 
-def _density(total, level, coarser):
+def _density(total, level, coarser, token):
     """Samples per squared fine spacing, from the sums of one grid and what the coarser
     grids say."""
-    per_coarse_area = (2 * jnp.pi) ** 0.5 * _WIDTH * total
-    here = per_coarse_area / 4.0**level
+    per_coarse_area = lambda total: (2 * jnp.pi) ** 0.5 * _WIDTH * total
     if coarser is None:
-        return here
-    return _blend(_trust(per_coarse_area), here, prolong(coarser, total.shape))
+        return per_coarse_area(total) / 4.0**level
+    around = prolong(coarser, total.shape, token=token)
+
+    def blend(total, around):
+        here = per_coarse_area(total)
+        return _blend(_trust(here), here / 4.0**level, around)
+
+    return stage(token, blend, total, around)
 
 
 def _trust(density):
@@ -125,7 +134,7 @@ def _own_weight(q):
     return jnp.prod(0.5 - 0.5 * t * (1 - t), axis=-1)
 
 
-def _noise(q, normals, real, shape, around):
+def _noise(q, normals, real, shape, around, token):
     """The root mean square of the offsets from the local mean, in fine spacings.
 
     Means are over the other samples, and samples count as far as they have neighbors.
@@ -135,7 +144,7 @@ def _noise(q, normals, real, shape, around):
     center = (jnp.asarray(shape, q.dtype) - 1) / 2
 
     def mean_of_others(w):
-        total = interpolate(smooth(splat(weights * w, q, shape)), q)
+        total = interpolate(smooth(splat(weights * w, q, shape), token=token), q)
         return (total - around.own * w) / around.others
 
     # One after the other: a batched scatter is many times slower.

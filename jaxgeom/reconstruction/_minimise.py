@@ -27,7 +27,7 @@ from ..linear import (
 )
 from ._density import at_level
 
-_COARSE_STEPS = 3
+_COARSE_STEPS = 5
 _WALL = 100.0
 
 

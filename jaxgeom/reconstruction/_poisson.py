@@ -28,7 +28,6 @@ from .._core import (
     first_failure,
     safe_divide,
     safe_normalize,
-    stage,
 )
 from ..linear import LinearSolution, cosine_solve, interpolate
 from ..shapes import Grid, PointCloud
@@ -137,8 +136,9 @@ def _solve(cloud, grid, method, screening, weights, token) -> FieldSolution:
         levels = levels_for(cloud.points.shape[0], shape)
     samples = _samples(cloud, grid)
     unit = jnp.prod(grid.spacing) ** (1 / 3)
-    measure = lambda s: sample_geometry(s.q, s.normals, s.real, shape, levels=levels)
-    found = stage(token, measure, samples)
+    found = sample_geometry(
+        samples.q, samples.normals, samples.real, shape, levels=levels, token=token
+    )
     if screening is None:
         screening = _screening_for(found.noise)
     strength = found.area if weights is None else found.area * weights
