@@ -8,12 +8,11 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core import RESULTS, check_shape, failure_where, safe_divide, safe_norm
 from ..shapes import TriangleMesh
 from ._backends import usable
-from ._blocks import Blocks, pack, search_tile
-from ._knn import build, knn
-from ._morton import bounds, codes, morton_order
+from ._morton import curve
+from ._tree import grow, search_tree
 
-_BLOCK = 16
-_TILE = 32
+_LEAF = 4
+_LANES = 1024
 
 
 class ClosestPoint(eqx.Module):
@@ -67,51 +66,23 @@ def closest_on_mesh(mesh: TriangleMesh, queries: Float[Array, "q 3"]) -> Closest
 # Outside jit, loops would compile what they close over as constants (slowly).
 @jax.jit
 def _nearest_faces(corners, mask, queries, live):
+    """The face nearest to each query; f where there is none."""
     low, high = jnp.min(corners, axis=1), jnp.max(corners, axis=1)
     centers = jnp.mean(corners, axis=1)
     mask = mask & jnp.all(jnp.isfinite(centers), axis=-1)
-    box = bounds(centers, mask)
-    order, _, _ = morton_order(jnp.where(mask[:, None], centers, 0), mask, *box)
-    blocks = pack(order, mask, low, high, _BLOCK)
-    start = knn(build(centers, mask), queries, 1, mask=live).indices[:, 0]
-    ranks = jnp.arange(queries.shape[0], dtype=jnp.int32)
-    span = bounds(queries, live)
-    *_, rows = jax.lax.sort(
-        (*codes(queries, span[0], jnp.max(span[1] - span[0])), ranks), num_keys=2
-    )
-    return _search(blocks, corners, queries, start, rows)
+    centers = jnp.where(mask[:, None], centers, 0)
+    tree = grow(curve(centers, mask), mask, low, high, _LEAF)
+    packed = corners.at[tree.order].get(mode="fill", fill_value=jnp.inf)
+    packed = jnp.moveaxis(packed, 0, -1)
 
+    def squares(slots, points):
+        each = [[packed[i, d][slots] for d in range(3)] for i in range(3)]
+        return _squares(jnp.asarray(each), points[:, None])
 
-def _search(blocks: Blocks, corners, queries, start, rows):
-    """The nearest face of each query, beginning with face `start`, in order `rows`."""
-    f, q = corners.shape[0], queries.shape[0]
-    packed = corners.at[blocks.order].get(mode="fill", fill_value=0)
-    packed = jnp.moveaxis(packed, 1, -1)
-    rows = jnp.pad(rows, (0, -q % _TILE), mode="edge").reshape(-1, _TILE)
-
-    def tile(row):
-        here = queries[row]
-
-        def visit(best, block):
-            squares = _squares(packed[block][..., None, :], here.T[..., None])
-            items = blocks.order[block]
-            squares = jnp.where(items < f, squares, jnp.inf)
-            least = jnp.min(squares, axis=1)
-            item = jnp.min(jnp.where(squares == least[:, None], items, f), axis=1)
-            better = least < best[0]
-            return jnp.where(better, least, best[0]), jnp.where(better, item, best[1])
-
-        first = jnp.moveaxis(
-            corners.at[start[row]].get(mode="fill", fill_value=0), 0, -1
-        )
-        squares = _squares(first, here.T)
-        squares = jnp.where(start[row] < f, squares, -jnp.inf)
-        return search_tile(here, blocks, (squares, start[row]), visit, lambda b: b[0])[
-            1
-        ]
-
-    found = jax.lax.map(tile, rows).reshape(-1)
-    return jnp.zeros(q, jnp.int32).at[rows.reshape(-1)].set(found)
+    limits = jnp.full(queries.shape[0], jnp.inf, queries.dtype)
+    queue = (curve(queries, live), jnp.sum(live))
+    near = search_tree(tree, queries, limits, queue, squares, k=1, lanes=_LANES)
+    return jnp.minimum(near.items[0], corners.shape[0])
 
 
 def _squares(corners: Float[Array, "3 3 *t"], point: Float[Array, "3 *t"]):
