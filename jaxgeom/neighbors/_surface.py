@@ -34,10 +34,9 @@ class ClosestPoint(eqx.Module):
 def closest_on_mesh(mesh: TriangleMesh, queries: Float[Array, "q 3"]) -> ClosestPoint:
     """The exact closest point of the mesh to every query [q, 3].
 
-    Faces are packed along a Morton curve into blocks with bounding boxes; queries, in
-    small tiles, start from the face with the nearest center and visit the blocks that
-    may be nearer. Which face is nearest is a constant under differentiation; given the
-    face, the gradient of the distance is the unit vector from the closest point to the
+    Queries descend a tree of bounding boxes of the faces, sorted along a Morton curve.
+    Which face is nearest is a constant under differentiation; given the face, the
+    gradient of the distance is the unit vector from the closest point to the
     query, shared among the corners by minus the barycentric coordinates (the envelope
     theorem), and zero on the surface itself.
 
