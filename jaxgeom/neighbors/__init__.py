@@ -13,5 +13,7 @@ from ._knn import knn as knn
 from ._signed import SignedDistance as SignedDistance
 from ._signed import signed_distance as signed_distance
 from ._surface import ClosestPoint as ClosestPoint
+from ._surface import SurfaceIndex as SurfaceIndex
 from ._surface import closest_on_mesh as closest_on_mesh
+from ._surface import index_surface as index_surface
 from ._winding import winding_number as winding_number

@@ -9,7 +9,7 @@ from .._core import RESULTS, check_shape, failure_where, safe_divide, safe_norm
 from ..shapes import TriangleMesh
 from ._backends import usable
 from ._morton import curve
-from ._tree import grow, search_tree
+from ._tree import Tree, grow, search_tree
 
 _LEAF = 4
 _LANES = 1024
@@ -31,24 +31,47 @@ class ClosestPoint(eqx.Module):
     result: RESULTS
 
 
-def closest_on_mesh(mesh: TriangleMesh, queries: Float[Array, "q 3"]) -> ClosestPoint:
+class SurfaceIndex(eqx.Module):
+    """The faces of a mesh prepared for repeated searches.
+
+    Gradients flow through `corners` [f, 3, 3]; `packed` holds them again in the order
+    of the tree, as constants.
+    """
+
+    corners: Float[Array, "f 3 3"]
+    mask: Bool[Array, " f"]
+    tree: Tree
+    packed: Float[Array, "3 3 m"]
+
+
+def index_surface(mesh: TriangleMesh) -> SurfaceIndex:
+    """The search structure of a mesh, for more than one call of `closest_on_mesh`."""
+    mesh = jax.tree.map(jnp.asarray, mesh)
+    corners = mesh.triangles()
+    return SurfaceIndex(
+        corners, mesh.face_mask, *_plant(jax.lax.stop_gradient(corners), mesh.face_mask)
+    )
+
+
+def closest_on_mesh(
+    mesh: TriangleMesh | SurfaceIndex, queries: Float[Array, "q 3"]
+) -> ClosestPoint:
     """The exact closest point of the mesh to every query [q, 3].
 
-    Queries descend a tree of bounding boxes of the faces, sorted along a Morton curve.
-    Which face is nearest is a constant under differentiation; given the face, the
-    gradient of the distance is the unit vector from the closest point to the
-    query, shared among the corners by minus the barycentric coordinates (the envelope
-    theorem), and zero on the surface itself.
+    Queries descend a tree of bounding boxes of the faces, sorted along a Morton curve;
+    pass `index_surface(mesh)` to grow it only once. Which face is nearest is a constant
+    under differentiation; given the face, the gradient of the distance is the unit
+    vector from the closest point to the query, shared among the corners by minus the
+    barycentric coordinates (the envelope theorem), and zero on the surface itself.
 
     Source: C. Ericson, Real-Time Collision Detection, 2005, 5.1.5 (closest point).
     """
     check_shape("queries", queries, (None, 3))
-    queries = jnp.asarray(queries, mesh.vertices.dtype)
-    corners = mesh.triangles()
-    face_mask = mesh.face_mask
+    index = mesh if isinstance(mesh, SurfaceIndex) else index_surface(mesh)
+    corners = index.corners
+    queries = jnp.asarray(queries, corners.dtype)
     fixed, live = usable(queries, jnp.ones(queries.shape[0], bool))
-    still = jax.lax.stop_gradient(corners)
-    faces = _nearest_faces(still, face_mask, fixed, live)
+    faces = _nearest_faces(jax.lax.stop_gradient(index), fixed, live)
     found = faces < corners.shape[0]
     triangle = corners.at[faces].get(mode="fill", fill_value=0)
     washed = jnp.where(found[:, None], queries, 0)
@@ -58,30 +81,35 @@ def closest_on_mesh(mesh: TriangleMesh, queries: Float[Array, "q 3"]) -> Closest
     constant = jax.lax.stop_gradient(weights)
     gap = washed - jnp.einsum("qi,qid->qd", constant, triangle)
     distances = jnp.where(found, safe_norm(gap), jnp.inf)
-    result = failure_where(~jnp.any(face_mask), RESULTS.no_surface)
+    result = failure_where(~jnp.any(index.mask), RESULTS.no_surface)
     return ClosestPoint(points, distances, faces, weights, found, result)
 
 
-# Outside jit, loops would compile what they close over as constants (slowly).
 @jax.jit
-def _nearest_faces(corners, mask, queries, live):
-    """The face nearest to each query; f where there is none."""
+def _plant(corners, mask):
+    """The tree of the faces, and their corners in its order."""
     low, high = jnp.min(corners, axis=1), jnp.max(corners, axis=1)
     centers = jnp.mean(corners, axis=1)
     mask = mask & jnp.all(jnp.isfinite(centers), axis=-1)
     centers = jnp.where(mask[:, None], centers, 0)
     tree = grow(curve(centers, mask), mask, low, high, _LEAF)
     packed = corners.at[tree.order].get(mode="fill", fill_value=jnp.inf)
-    packed = jnp.moveaxis(packed, 0, -1)
+    return tree, jnp.moveaxis(packed, 0, -1)
+
+
+# Outside jit, loops would compile what they close over as constants (slowly).
+@jax.jit
+def _nearest_faces(index, queries, live):
+    """The face nearest to each query; f where there is none."""
 
     def squares(slots, points):
-        each = [[packed[i, d][slots] for d in range(3)] for i in range(3)]
+        each = [[index.packed[i, d][slots] for d in range(3)] for i in range(3)]
         return _squares(jnp.asarray(each), points[:, None])
 
     limits = jnp.full(queries.shape[0], jnp.inf, queries.dtype)
     queue = (curve(queries, live), jnp.sum(live))
-    near = search_tree(tree, queries, limits, queue, squares, k=1, lanes=_LANES)
-    return jnp.minimum(near.items[0], corners.shape[0])
+    near = search_tree(index.tree, queries, limits, queue, squares, k=1, lanes=_LANES)
+    return jnp.minimum(near.items[0], index.corners.shape[0])
 
 
 def _squares(corners: Float[Array, "3 3 *t"], point: Float[Array, "3 *t"]):
