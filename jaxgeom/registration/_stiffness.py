@@ -68,10 +68,12 @@ class AsRigidAsPossible(AbstractDeformation):
 
     def strain(self, prepared, frames):
         pairs = prepared.links
-        rest, now = pairs.between(prepared.rest.points), pairs.between(frames.points)
+        rest = pairs.between(prepared.rest.points)
+        start, end = _ends(pairs, frames)
         scale = jnp.sqrt(pairs.weights / 2)[:, None] / pairs.length
-        turned = lambda end: jnp.einsum("eij,ej->ei", frames.linear[end], rest)
-        return tuple(scale * (now - turned(i)) for i in (pairs.start, pairs.end))
+        turned = lambda at: jnp.einsum("eij,ej->ei", at.linear, rest)
+        now = end.points - start.points
+        return tuple(scale * (now - turned(at)) for at in (start, end))
 
 
 class PerVertexAffine(AbstractDeformation):
@@ -107,10 +109,24 @@ class PerVertexAffine(AbstractDeformation):
         return Frames(frames.points + tangent[:, :3], frames.linear + change)
 
     def strain(self, prepared, frames):
-        pairs, linear = prepared.links, frames.linear
-        rest, now = pairs.between(prepared.rest.points), pairs.between(frames.points)
-        mean = (linear[pairs.start] + linear[pairs.end]) / 2
-        apart = now - jnp.einsum("eij,ej->ei", mean, rest)
+        pairs = prepared.links
+        rest = pairs.between(prepared.rest.points)
+        start, end = _ends(pairs, frames)
+        mean = (start.linear + end.linear) / 2
+        apart = end.points - start.points - jnp.einsum("eij,ej->ei", mean, rest)
         scale = jnp.sqrt(pairs.weights) / pairs.length
-        differ = scale[:, None, None] * (linear[pairs.end] - linear[pairs.start])
+        differ = scale[:, None, None] * (end.linear - start.linear)
         return self.reach * differ, scale[:, None] * apart
+
+
+def _ends(pairs: Links, frames: Frames) -> tuple[Frames, Frames]:
+    """The frames at both ends of the sides of faces.
+
+    The end of a side is the start of the next one: every corner is read only once, and
+    written only once where this is transposed.
+    """
+    fold = lambda x: x[pairs.start].reshape(-1, 3, *x.shape[1:])
+    corners = jax.tree.map(fold, frames)
+    flat = lambda x: x.reshape(-1, *x.shape[2:])
+    ahead = jax.tree.map(lambda x: flat(jnp.roll(x, -1, axis=1)), corners)
+    return jax.tree.map(flat, corners), ahead
