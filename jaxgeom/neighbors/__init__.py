@@ -5,8 +5,15 @@ from ._brute import BruteForce as BruteForce
 from ._brute import BruteIndex as BruteIndex
 from ._cells import CellIndex as CellIndex
 from ._cells import CellList as CellList
+from ._host import HostIndex as HostIndex
+from ._host import HostTree as HostTree
 from ._knn import Neighbors as Neighbors
 from ._knn import build as build
 from ._knn import knn as knn
+from ._signed import SignedDistance as SignedDistance
+from ._signed import signed_distance as signed_distance
 from ._surface import ClosestPoint as ClosestPoint
+from ._surface import SurfaceIndex as SurfaceIndex
 from ._surface import closest_on_mesh as closest_on_mesh
+from ._surface import index_surface as index_surface
+from ._winding import winding_number as winding_number

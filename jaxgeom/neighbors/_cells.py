@@ -3,7 +3,7 @@
 Points are sorted by cell. A query looks at the 2 x 2 x 2 cells around it: four runs of
 two cells, read as one list. What it finds is certainly right where the k-th distance is
 at most the distance to the boundary of these cells; the other queries (few, if the cell
-size suits the density) are searched again in blocks.
+size suits the density) are searched again in a tree.
 """
 
 import equinox as eqx
@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._core import prefix_sum
 from ._backends import AbstractBackend, AbstractIndex, in_tiles, usable
-from ._blocks import Blocks, pack, search_tile
-from ._morton import LEVELS, bounds, codes, morton_order, occupied_cells
+from ._morton import LEVELS, bounds, curve, morton_order, occupied_cells
+from ._tree import Tree, grow, insert, search_tree
 
-_BLOCK = 16
-_FALLBACK_TILE = 32
+_LEAF = 8
+_LANES = 1024
 # Lists of k candidates per query of a tile should stay in the cache.
 _TILE_ENTRIES = 4096
 _SMALLEST_TABLE, _LARGEST_TABLE = 2**12, 2**24
@@ -25,7 +25,7 @@ _CELLS_PER_POINT = 16
 
 
 class CellIndex(AbstractIndex):
-    """Points sorted into cells of one size, and into blocks."""
+    """Points sorted into cells of one size, and into a tree."""
 
     points: Float[Array, "n 3"]
     mask: Bool[Array, " n"]
@@ -36,7 +36,7 @@ class CellIndex(AbstractIndex):
     starts: Int[Array, " c"]
     order: Int[Array, " n"]
     coordinates: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
-    blocks: Blocks
+    tree: Tree
     longest: int = eqx.field(static=True)
 
     # Outside jit, control flow compiles what it closes over as constants, anew at
@@ -44,13 +44,13 @@ class CellIndex(AbstractIndex):
     @eqx.filter_jit
     def search(self, queries, active, k, reach):
         size = max(256, _TILE_ENTRIES // k)
-        found, certain = in_tiles(
+        found, squares, certain = in_tiles(
             lambda rows: _search_cells(self, *rows, k, reach), (queries, active), size
         )
         wanted = active & ~certain
         return jax.lax.cond(
             jnp.any(wanted),
-            lambda: _search_blocks(self, queries, wanted, found, k, reach),
+            lambda: _search_again(self, queries, wanted, found, squares, k, reach),
             lambda: found,
         )
 
@@ -69,7 +69,7 @@ class CellList(AbstractBackend):
         points, mask = usable(points, mask)
         low, high = bounds(points, mask)
         order, coarse, fine = morton_order(points, mask, low, high)
-        blocks = pack(order, mask, points, points, _BLOCK)
+        tree = grow(order, mask, points, points, _LEAF)
         per_cell = max(4, 4 * self.neighbors // 3)
         width = _density_width(coarse, fine, mask[order], high - low, per_cell)
         table = _table_size(points.shape[0])
@@ -83,7 +83,7 @@ class CellList(AbstractBackend):
         starts = prefix_sum(jnp.zeros(table + 1, jnp.int32).at[cell].add(1))
         soa = tuple(points[:, d][order] for d in range(3))
         return CellIndex(
-            *(given, real, low, high, width, counts, starts, order, soa, blocks),
+            *(given, real, low, high, width, counts, starts, order, soa, tree),
             longest=16 * per_cell,
         )
 
@@ -127,7 +127,8 @@ def _cell_id(cell, counts):
 
 
 def _search_cells(index, queries, active, k, reach):
-    """The k nearest in the 2 x 2 x 2 cells around, and whether that is certain."""
+    """The k nearest in the 2 x 2 x 2 cells around, how far the search has to reach if
+    that is not certain, and whether it is."""
     n, starts = index.points.shape[0], index.starts
     last = (index.counts - 1).astype(queries.dtype)
     scaled = (queries - index.low) / index.width
@@ -155,7 +156,7 @@ def _search_cells(index, queries, active, k, reach):
             (queries[:, d] - index.coordinates[d].at[position].get(mode="clip")) ** 2
             for d in range(3)
         )
-        return _insert(best, jnp.where(j < length, square, jnp.inf), position)
+        return insert(best, jnp.where(j < length, square, jnp.inf), position)
 
     empty = jnp.full((k, queries.shape[0]), jnp.inf, queries.dtype)
     best = (empty, jnp.full(empty.shape, n, jnp.int32))
@@ -163,8 +164,8 @@ def _search_cells(index, queries, active, k, reach):
     positions = jnp.where(squares <= reach, positions, n)
     found = index.order.at[positions].get(mode="fill", fill_value=n)
     room = _room(index, queries, first, final)
-    certain = (total <= index.longest) & (jnp.minimum(squares[-1], reach) <= room)
-    return found.T, certain
+    least = jnp.minimum(squares[-1], reach)
+    return found.T, least, (total <= index.longest) & (least <= room)
 
 
 def _without_repeats(runs, counts):
@@ -187,16 +188,6 @@ def _chain(runs):
     return ends, shifts, total
 
 
-def _insert(best, square, item):
-    """One more candidate into the ascending lists best = (squares, items) [k, t]."""
-    squares, items = best
-    ahead = jnp.concatenate([jnp.full_like(squares[:1], -jnp.inf), squares[:-1]])
-    ahead_items = jnp.concatenate([items[:1], items[:-1]])
-    moved = jnp.where(square < ahead, ahead_items, item)
-    items = jnp.where(square < squares, moved, items)
-    return jnp.minimum(squares, jnp.maximum(ahead, square)), items
-
-
 def _room(index, queries, first, final):
     """The squared distance to the nearest cell that was not looked at."""
     low, high, width = index.low, index.high, index.width
@@ -212,44 +203,19 @@ def _room(index, queries, first, final):
     return jnp.maximum(room, 0) ** 2
 
 
-def _search_blocks(index, queries, wanted, found, k, reach):
-    """`found`, with the wanted rows searched again in blocks, tile by tile."""
-    n, q = index.points.shape[0], queries.shape[0]
-    side = jnp.max(index.high - index.low)
-    coarse, fine = codes(queries, index.low, side)
-    coarse = jnp.where(wanted, coarse, jnp.uint32(2**31))
-    rows = jnp.arange(q, dtype=jnp.int32)
-    *_, rows = jax.lax.sort((coarse, fine, rows), num_keys=2)
-    rows = jnp.pad(rows, (0, -q % _FALLBACK_TILE), constant_values=q)
-    blocks = index.blocks
+def _search_again(index, queries, wanted, found, limits, k, reach):
+    """`found`, with the wanted rows searched again, up to the squares `limits`."""
+    # The same distance may be rounded differently here and in the cells.
+    limits = limits * (1 + 8 * jnp.finfo(limits.dtype).eps)
+    tree = index.tree
     clean, _ = usable(index.points, index.mask)
-    soa = [
-        clean[:, d].at[blocks.order].get(mode="fill", fill_value=jnp.inf)
-        for d in range(3)
-    ]
+    soa = clean.T.at[:, tree.order].get(mode="fill", fill_value=jnp.inf)
 
-    def tile(i, found):
-        row = jax.lax.dynamic_slice(rows, (i * _FALLBACK_TILE,), (_FALLBACK_TILE,))
-        live = (row < q) & wanted.at[row].get(mode="fill", fill_value=False)
-        # Dead rows repeat the first one, so that they do not widen the tile.
-        here = queries[jnp.where(live, row, row[0])]
-        limit = jnp.where(live, reach, -1)
+    def squares(slots, points):
+        return sum((points[d] - soa[d][slots]) ** 2 for d in range(3))
 
-        def visit(best, block):
-            near = sum((here[:, d, None] - soa[d][block]) ** 2 for d in range(3))
-            items = jnp.broadcast_to(blocks.order[block], near.shape)
-            near = jnp.where(items < n, near, jnp.inf)
-            squares = jnp.concatenate([best[0], near], axis=1)
-            items = jnp.concatenate([best[1], items], axis=1)
-            negative, pick = jax.lax.top_k(-squares, k)
-            return -negative, jnp.take_along_axis(items, pick, axis=1)
-
-        empty = jnp.full((_FALLBACK_TILE, k), jnp.inf, queries.dtype)
-        best = (empty, jnp.full(empty.shape, n, jnp.int32))
-        bound = lambda best: jnp.minimum(best[0][:, -1], limit)
-        squares, items = search_tile(here, blocks, best, visit, bound)
-        items = jnp.where(squares <= limit[:, None], items, n)
-        return found.at[jnp.where(live, row, q)].set(items, mode="drop")
-
-    tiles = (jnp.sum(wanted) + _FALLBACK_TILE - 1) // _FALLBACK_TILE
-    return jax.lax.fori_loop(0, tiles, tile, found)
+    queue = (curve(queries, wanted), jnp.sum(wanted))
+    near = search_tree(tree, queries, limits, queue, squares, k=k, lanes=_LANES)
+    n = index.points.shape[0]
+    items = jnp.where(near.squares <= reach, jnp.minimum(near.items, n), n).T
+    return jnp.where(wanted[:, None], items, found)

@@ -40,7 +40,8 @@ def build(
     """The search structure of `points` [n, 3]; only those where `mask` are ever found.
 
     `backend` is `CellList(neighbors=k)`, best where k is about the number of neighbors
-    asked for later (1 by default), or `BruteForce()` for up to about a thousand points.
+    asked for later (1 by default), `BruteForce()` for up to about a thousand points, or
+    `HostTree()`, scipy's k-d tree, for a CPU.
     Points that are not finite are never found. Raises `GeometryError` for wrong shapes.
     """
     check_shape("points", points, (None, 3))

@@ -36,6 +36,11 @@ def morton_order(points, mask, low, high):
     return order, coarse, fine
 
 
+def curve(points: Float[Array, "n 3"], mask: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """The rows of the real points along a Morton curve through them, then the rest."""
+    return morton_order(points, mask, *bounds(points, mask))[0]
+
+
 def occupied_cells(coarse, fine, mask) -> Int[Array, " levels"]:
     """The number of octree cells that hold points, at levels 0 to 20.
 

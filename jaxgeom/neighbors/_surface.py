@@ -8,12 +8,11 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core import RESULTS, check_shape, failure_where, safe_divide, safe_norm
 from ..shapes import TriangleMesh
 from ._backends import usable
-from ._blocks import Blocks, pack, search_tile
-from ._knn import build, knn
-from ._morton import bounds, codes, morton_order
+from ._morton import curve
+from ._tree import Tree, grow, search_tree
 
-_BLOCK = 16
-_TILE = 32
+_LEAF = 4
+_LANES = 1024
 
 
 class ClosestPoint(eqx.Module):
@@ -32,25 +31,47 @@ class ClosestPoint(eqx.Module):
     result: RESULTS
 
 
-def closest_on_mesh(mesh: TriangleMesh, queries: Float[Array, "q 3"]) -> ClosestPoint:
+class SurfaceIndex(eqx.Module):
+    """The faces of a mesh prepared for repeated searches.
+
+    Gradients flow through `corners` [f, 3, 3]; `packed` holds them again in the order
+    of the tree, as constants.
+    """
+
+    corners: Float[Array, "f 3 3"]
+    mask: Bool[Array, " f"]
+    tree: Tree
+    packed: Float[Array, "3 3 m"]
+
+
+def index_surface(mesh: TriangleMesh) -> SurfaceIndex:
+    """The search structure of a mesh, for more than one call of `closest_on_mesh`."""
+    mesh = jax.tree.map(jnp.asarray, mesh)
+    corners = mesh.triangles()
+    return SurfaceIndex(
+        corners, mesh.face_mask, *_plant(jax.lax.stop_gradient(corners), mesh.face_mask)
+    )
+
+
+def closest_on_mesh(
+    mesh: TriangleMesh | SurfaceIndex, queries: Float[Array, "q 3"]
+) -> ClosestPoint:
     """The exact closest point of the mesh to every query [q, 3].
 
-    Faces are packed along a Morton curve into blocks with bounding boxes; queries, in
-    small tiles, start from the face with the nearest center and visit the blocks that
-    may be nearer. Which face is nearest is a constant under differentiation; given the
-    face, the gradient of the distance is the unit vector from the closest point to the
-    query, shared among the corners by minus the barycentric coordinates (the envelope
-    theorem), and zero on the surface itself.
+    Queries descend a tree of bounding boxes of the faces, sorted along a Morton curve;
+    pass `index_surface(mesh)` to grow it only once. Which face is nearest is a constant
+    under differentiation; given the face, the gradient of the distance is the unit
+    vector from the closest point to the query, shared among the corners by minus the
+    barycentric coordinates (the envelope theorem), and zero on the surface itself.
 
     Source: C. Ericson, Real-Time Collision Detection, 2005, 5.1.5 (closest point).
     """
     check_shape("queries", queries, (None, 3))
-    queries = jnp.asarray(queries, mesh.vertices.dtype)
-    corners = mesh.triangles()
-    face_mask = mesh.face_mask
+    index = mesh if isinstance(mesh, SurfaceIndex) else index_surface(mesh)
+    corners = index.corners
+    queries = jnp.asarray(queries, corners.dtype)
     fixed, live = usable(queries, jnp.ones(queries.shape[0], bool))
-    still = jax.lax.stop_gradient(corners)
-    faces = _nearest_faces(still, face_mask, fixed, live)
+    faces = _nearest_faces(jax.lax.stop_gradient(index), fixed, live)
     found = faces < corners.shape[0]
     triangle = corners.at[faces].get(mode="fill", fill_value=0)
     washed = jnp.where(found[:, None], queries, 0)
@@ -60,58 +81,35 @@ def closest_on_mesh(mesh: TriangleMesh, queries: Float[Array, "q 3"]) -> Closest
     constant = jax.lax.stop_gradient(weights)
     gap = washed - jnp.einsum("qi,qid->qd", constant, triangle)
     distances = jnp.where(found, safe_norm(gap), jnp.inf)
-    result = failure_where(~jnp.any(face_mask), RESULTS.no_surface)
+    result = failure_where(~jnp.any(index.mask), RESULTS.no_surface)
     return ClosestPoint(points, distances, faces, weights, found, result)
+
+
+@jax.jit
+def _plant(corners, mask):
+    """The tree of the faces, and their corners in its order."""
+    low, high = jnp.min(corners, axis=1), jnp.max(corners, axis=1)
+    centers = jnp.mean(corners, axis=1)
+    mask = mask & jnp.all(jnp.isfinite(centers), axis=-1)
+    centers = jnp.where(mask[:, None], centers, 0)
+    tree = grow(curve(centers, mask), mask, low, high, _LEAF)
+    packed = corners.at[tree.order].get(mode="fill", fill_value=jnp.inf)
+    return tree, jnp.moveaxis(packed, 0, -1)
 
 
 # Outside jit, loops would compile what they close over as constants (slowly).
 @jax.jit
-def _nearest_faces(corners, mask, queries, live):
-    low, high = jnp.min(corners, axis=1), jnp.max(corners, axis=1)
-    centers = jnp.mean(corners, axis=1)
-    mask = mask & jnp.all(jnp.isfinite(centers), axis=-1)
-    box = bounds(centers, mask)
-    order, _, _ = morton_order(jnp.where(mask[:, None], centers, 0), mask, *box)
-    blocks = pack(order, mask, low, high, _BLOCK)
-    start = knn(build(centers, mask), queries, 1, mask=live).indices[:, 0]
-    ranks = jnp.arange(queries.shape[0], dtype=jnp.int32)
-    span = bounds(queries, live)
-    *_, rows = jax.lax.sort(
-        (*codes(queries, span[0], jnp.max(span[1] - span[0])), ranks), num_keys=2
-    )
-    return _search(blocks, corners, queries, start, rows)
+def _nearest_faces(index, queries, live):
+    """The face nearest to each query; f where there is none."""
 
+    def squares(slots, points):
+        each = [[index.packed[i, d][slots] for d in range(3)] for i in range(3)]
+        return _squares(jnp.asarray(each), points[:, None])
 
-def _search(blocks: Blocks, corners, queries, start, rows):
-    """The nearest face of each query, beginning with face `start`, in order `rows`."""
-    f, q = corners.shape[0], queries.shape[0]
-    packed = corners.at[blocks.order].get(mode="fill", fill_value=0)
-    packed = jnp.moveaxis(packed, 1, -1)
-    rows = jnp.pad(rows, (0, -q % _TILE), mode="edge").reshape(-1, _TILE)
-
-    def tile(row):
-        here = queries[row]
-
-        def visit(best, block):
-            squares = _squares(packed[block][..., None, :], here.T[..., None])
-            items = blocks.order[block]
-            squares = jnp.where(items < f, squares, jnp.inf)
-            least = jnp.min(squares, axis=1)
-            item = jnp.min(jnp.where(squares == least[:, None], items, f), axis=1)
-            better = least < best[0]
-            return jnp.where(better, least, best[0]), jnp.where(better, item, best[1])
-
-        first = jnp.moveaxis(
-            corners.at[start[row]].get(mode="fill", fill_value=0), 0, -1
-        )
-        squares = _squares(first, here.T)
-        squares = jnp.where(start[row] < f, squares, -jnp.inf)
-        return search_tile(here, blocks, (squares, start[row]), visit, lambda b: b[0])[
-            1
-        ]
-
-    found = jax.lax.map(tile, rows).reshape(-1)
-    return jnp.zeros(q, jnp.int32).at[rows.reshape(-1)].set(found)
+    limits = jnp.full(queries.shape[0], jnp.inf, queries.dtype)
+    queue = (curve(queries, live), jnp.sum(live))
+    near = search_tree(index.tree, queries, limits, queue, squares, k=1, lanes=_LANES)
+    return jnp.minimum(near.items[0], index.corners.shape[0])
 
 
 def _squares(corners: Float[Array, "3 3 *t"], point: Float[Array, "3 *t"]):

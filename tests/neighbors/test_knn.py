@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxgeom._core import RESULTS, GeometryError
-from jaxgeom.neighbors import BruteForce, CellList, build, knn
+from jaxgeom.neighbors import BruteForce, CellList, HostTree, build, knn
 
 N, Q = 1200, 300
 
@@ -33,6 +33,10 @@ def _clouds():
         "line": (line, rng.uniform(-1, 1, (Q, 3))),
         "duplicates": (np.repeat(sphere[:10], N // 10, axis=0), sphere[:Q]),
         "one place": (np.full((N, 3), 2.5), sphere[:Q]),
+        "far apart": (
+            np.concatenate([sphere[:-1], [[3e5, -2e5, 1e5]]]),
+            2 * sphere[:Q],
+        ),
         "far queries": (sphere, 1e4 * sphere[:Q] + 3e4),
     }
 
@@ -54,7 +58,7 @@ def _assert_exact(points, queries, k, out):
 
 
 @pytest.mark.parametrize("name", CLOUDS)
-@pytest.mark.parametrize("backend", [CellList(4), BruteForce(tile=64)])
+@pytest.mark.parametrize("backend", [CellList(4), BruteForce(tile=64), HostTree()])
 def test_equals_a_tree(name, backend):
     points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS[name])
     find = jax.jit(lambda p, q: knn(build(p, backend=backend), q, 5))
@@ -69,7 +73,7 @@ def test_other_counts_of_neighbors(k):
     )
 
 
-@pytest.mark.parametrize("backend", [CellList(3), BruteForce()])
+@pytest.mark.parametrize("backend", [CellList(3), BruteForce(), HostTree()])
 def test_padding_and_missing_neighbors(backend):
     points, queries = CLOUDS["volume"]
     points, queries = jnp.asarray(points[:40]), jnp.asarray(queries[:9])
@@ -83,7 +87,7 @@ def test_padding_and_missing_neighbors(backend):
     assert bool(out.result == RESULTS.too_few_points)
 
 
-@pytest.mark.parametrize("backend", [CellList(6), BruteForce()])
+@pytest.mark.parametrize("backend", [CellList(6), BruteForce(), HostTree()])
 def test_max_distance_is_a_gate(backend):
     points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS["volume"])
     gate = 0.8
@@ -95,7 +99,7 @@ def test_max_distance_is_a_gate(backend):
     assert (gated.distances == jnp.where(inside, free.distances, jnp.inf)).all()
 
 
-@pytest.mark.parametrize("backend", [CellList(), BruteForce()])
+@pytest.mark.parametrize("backend", [CellList(), BruteForce(), HostTree(workers=1)])
 def test_vmap_is_a_loop(backend):
     names = ["surface", "volume", "plane"]
     points = jnp.asarray(np.stack([CLOUDS[n][0][:500] for n in names]), jnp.float32)
