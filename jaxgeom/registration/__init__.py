@@ -1,5 +1,12 @@
-"""Alignment of point clouds: features, matching, and consensus among wrong pairs."""
+"""Alignment: closest points by composition, features, consensus among wrong pairs."""
 
+from ._correspondences import ClosestSurface as ClosestSurface
+from ._correspondences import DistanceField as DistanceField
+from ._correspondences import Facing as Facing
+from ._correspondences import Mutual as Mutual
+from ._correspondences import Nearest as Nearest
+from ._correspondences import Parallel as Parallel
+from ._correspondences import Reciprocal as Reciprocal
 from ._features import Matches as Matches
 from ._features import fpfh as fpfh
 from ._features import match_features as match_features
@@ -7,5 +14,42 @@ from ._global import GlobalStart as GlobalStart
 from ._global import align_features as align_features
 from ._gnc import gnc as gnc
 from ._gnc import robust_procrustes as robust_procrustes
+from ._icp import Degeneracy as Degeneracy
+from ._icp import Method as Method
+from ._icp import PreparedTarget as PreparedTarget
+from ._icp import Registration as Registration
+from ._icp import icp as icp
+from ._icp import prepare_target as prepare_target
+from ._kernels import L2 as L2
+from ._kernels import AnnealedWidth as AnnealedWidth
+from ._kernels import Cauchy as Cauchy
+from ._kernels import FixedWidth as FixedWidth
+from ._kernels import GemanMcClure as GemanMcClure
+from ._kernels import Huber as Huber
+from ._kernels import QuantileWidth as QuantileWidth
+from ._kernels import Trimmed as Trimmed
+from ._kernels import Tukey as Tukey
+from ._kernels import Welsch as Welsch
+from ._kernels import deviation_width as deviation_width
+from ._models import AffineModel as AffineModel
+from ._models import GaussianPrior as GaussianPrior
+from ._models import RigidModel as RigidModel
+from ._models import SimilarityModel as SimilarityModel
+from ._models import planar as planar
+from ._models import rotation_about as rotation_about
+from ._models import translation_only as translation_only
+from ._models import yaw as yaw
+from ._objectives import Generalized as Generalized
+from ._objectives import Pair as Pair
+from ._objectives import PointToPlane as PointToPlane
+from ._objectives import PointToPoint as PointToPoint
+from ._objectives import PointToSurface as PointToSurface
+from ._objectives import Symmetric as Symmetric
 from ._ransac import Consensus as Consensus
 from ._ransac import ransac as ransac
+from ._solvers import Alternation as Alternation
+from ._solvers import GaussNewton as GaussNewton
+from ._solvers import LeastSquares as LeastSquares
+from ._solvers import LevenbergMarquardt as LevenbergMarquardt
+from ._solvers import Minimise as Minimise
+from ._thin import thin as thin
