@@ -19,7 +19,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from jaxgeom import PointCloud, Rigid, stack
-from jaxgeom.pipelines import MeanAligned, register, register_many
+from jaxgeom.pipelines import MeanAligned, Pyramid, register, register_many
 
 DATA = pathlib.Path(os.environ.get("JAXGEOM_DATA", ".")) / "registration"
 # target source floor in degrees, in mm
@@ -174,8 +174,14 @@ def fricp():
     folder = DATA / "fricp"
     source, target = (vertices(folder / f"{n}.ply") for n in ("source", "target"))
     truth = np.loadtxt(folder / "m3trans.txt")
-    found = register(source, target, init=MeanAligned(), throw=False)
-    report("fricp", found, truth, source, "0.01 deg", 1)
+    for name, pyramid in (
+        ("fricp", Pyramid()),
+        ("fricp, all", Pyramid((4.0, 2.0, 1.0, 0.0), (30.0, 10.0, 4.0, 2.0))),
+    ):
+        found = register(
+            source, target, init=MeanAligned(), pyramid=pyramid, throw=False
+        )
+        report(name, found, truth, source, "0.01 deg", 1)
 
 
 def halves():

@@ -19,6 +19,7 @@ from ._icp import Method as Method
 from ._icp import PreparedTarget as PreparedTarget
 from ._icp import Registration as Registration
 from ._icp import icp as icp
+from ._icp import icp_unrolled as icp_unrolled
 from ._icp import prepare_target as prepare_target
 from ._kernels import L2 as L2
 from ._kernels import AnnealedWidth as AnnealedWidth
@@ -53,3 +54,5 @@ from ._solvers import LeastSquares as LeastSquares
 from ._solvers import LevenbergMarquardt as LevenbergMarquardt
 from ._solvers import Minimise as Minimise
 from ._thin import thin as thin
+from ._uncertainty import pose_covariance as pose_covariance
+from ._uncertainty import sandwich_covariance as sandwich_covariance

@@ -124,8 +124,9 @@ class _Scene(eqx.Module):
         problem = problem_of(*args, **parts)
         zero = jnp.zeros(problem.size, moved.points.dtype)
         width = method.kernel.width(problem.squares(zero), mask, previous)
-        # Residuals that are all zero leave no width, and without pairs it is unknown.
-        width = jnp.maximum(width, jnp.finfo(width.dtype).tiny ** 0.25)
+        # Residuals below rounding say nothing of the noise.
+        rounding = 64 * jnp.finfo(width.dtype).eps * _size_of(self)
+        width = jnp.maximum(width, rounding)
         width = jnp.where(jnp.any(mask), width, previous)
         return eqx.tree_at(lambda p: p.width, problem, width)
 
@@ -294,6 +295,40 @@ def _step_size(step, scene):
 
 def _size_of(scene):
     return jnp.max(jnp.abs(scene.tangent.basis))
+
+
+def icp_unrolled(
+    source: PointCloud,
+    target: PointCloud | TriangleMesh,
+    *,
+    init: Rigid | Similarity | Affine | None = None,
+    method: Method | None = None,
+    max_distance: Float[Array, ""] | float = jnp.inf,
+    weights: Float[Array, " n"] | None = None,
+    steps: int = 20,
+) -> Rigid | Similarity | Affine:
+    """The transform after a fixed number of steps, differentiated step by step.
+
+    For comparison with `icp`, whose derivative is that of the minimum: this one depends
+    on the start, and its memory grows with the steps. Arguments are those of `icp`.
+    """
+    method = Method() if method is None else method
+    scene = _scene(source, target, method, max_distance, weights)
+    _check_normals(scene)
+    start = Rigid.identity(scene.center.dtype) if init is None else init
+    pose = scene.inward(method.model.cast(start))
+    infinite = jnp.asarray(jnp.inf, scene.center.dtype)
+
+    def step(carry, _):
+        pose, width = carry
+        found = jax.lax.stop_gradient(scene.match(pose))
+        problem = scene.problem(pose, found, width)
+        # Widths found from the residuals are constants, as in `icp`.
+        move = method.solver.step(problem, jnp.asarray(method.solver.start()))
+        return (move.transform @ pose, jax.lax.stop_gradient(problem.width)), None
+
+    (pose, _), _ = jax.lax.scan(step, (pose, infinite), None, length=steps)
+    return scene.outward(pose)
 
 
 def _attached(problem, pose):
