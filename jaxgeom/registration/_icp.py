@@ -198,7 +198,9 @@ def icp(
     pose = scene.inward(method.model.cast(jax.tree.map(cast, start)))
     rtol = jnp.finfo(scene.center.dtype).eps ** (2 / 3) if rtol is None else rtol
     # The way to the minimum has no part in the derivative of the minimum.
-    still = jax.lax.stop_gradient((scene, pose))
+    # A field may be a plain function, which is no array.
+    arrays, rest = eqx.partition((scene, pose), eqx.is_array)
+    still = eqx.combine(jax.lax.stop_gradient(arrays), rest)
     state = _iterate(*still, rtol, max_steps, history)
     problem = scene.problem(state.pose, state.found, state.width)
     pose = _attached(problem, state.pose)

@@ -258,7 +258,8 @@ def test_surfaces_and_fields():
     ball = icosphere(3)
     rng = np.random.default_rng(5)
     stretch = np.array([1.0, 0.7, 0.5])
-    mesh = TriangleMesh(np.asarray(ball.vertices) * stretch, np.asarray(ball.faces))
+    vertices = jnp.asarray(ball.vertices * stretch, jnp.float32)
+    mesh = TriangleMesh(vertices, jnp.asarray(ball.faces))
     corners = np.asarray(mesh.triangles())[rng.integers(0, len(ball.faces), N)]
     shares = rng.dirichlet(np.ones(3), N)
     points = np.einsum("ni,nid->nd", shares, corners)
