@@ -42,6 +42,13 @@ _NAMES = {
     "Reconstruction": "pipelines",
     "reconstruct": "pipelines",
     "reconstruct_jit": "pipelines",
+    "MeanAligned": "pipelines",
+    "Pyramid": "pipelines",
+    "Registration": "registration",
+    "icp": "registration",
+    "register": "pipelines",
+    "register_jit": "pipelines",
+    "register_many": "pipelines",
 }
 __all__ = ["__version__", *_ROOMS, *_NAMES]
 

@@ -14,6 +14,8 @@ class RESULTS(optx.RESULTS):
     outside_grid = "Some points lie outside the grid: these points were ignored."
     no_surface = "The level set does not meet the grid: there is no surface."
     no_consensus = "Too few pairs of points agree on one transform."
+    no_overlap = "No source point has a target point within the allowed distance."
+    too_few_matches = "Fewer pairs of points than the alignment needs."
     not_converged = "The solver stopped before the residual fell below rtol."
 
 

@@ -4,6 +4,11 @@ from ._fuse import Fusion as Fusion
 from ._fuse import fuse as fuse
 from ._memory import memory_needed as memory_needed
 from ._prepare import prepare as prepare
+from ._pyramid import Pyramid as Pyramid
 from ._reconstruct import Reconstruction as Reconstruction
 from ._reconstruct import reconstruct as reconstruct
 from ._reconstruct import reconstruct_jit as reconstruct_jit
+from ._register import MeanAligned as MeanAligned
+from ._register import register as register
+from ._register import register_jit as register_jit
+from ._register import register_many as register_many

@@ -1,0 +1,123 @@
+"""Coarse to fine: thinned clouds with normals, and how far pairs may be apart."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._core import RESULTS, bucket, failure_where, first_failure
+from ..normals import estimate
+from ..registration import (
+    Method,
+    Registration,
+    Symmetric,
+    icp,
+    thin,
+)
+from ..shapes import PointCloud
+
+# Single precision may put a few points on the far side of the border of a voxel.
+_SLACK = 32
+
+
+class Pyramid(eqx.Module):
+    """The levels of an alignment, coarse first.
+
+    Level i thins both clouds to one point per voxel of side `voxels[i]` times the voxel
+    size (0: all points), and pairs points up to `gates[i]` voxel sizes apart. Normals
+    that are not given are estimated on each level from `neighbors` points.
+    """
+
+    voxels: tuple[float, ...] = eqx.field(static=True, default=(4.0, 2.0, 0.5))
+    gates: tuple[float, ...] = eqx.field(static=True, default=(30.0, 10.0, 4.0))
+    neighbors: int = eqx.field(static=True, default=12)
+    method: Method = Method(objective=Symmetric())
+    max_steps: int = eqx.field(static=True, default=50)
+
+
+def make_level(cloud: PointCloud, side, room: int | None, neighbors: int):
+    """One point per voxel, with normals; and how many there are."""
+    if room is None:
+        oriented = cloud.normals is not None
+        return cloud if oriented else estimate(cloud, k=neighbors), jnp.zeros((), int)
+    if cloud.normals is not None:
+        return thin(cloud, side, room)
+    bare = PointCloud(cloud.points, jnp.zeros_like(cloud.points), cloud.mask)
+    small, need = thin(bare, side, room)
+    return estimate(PointCloud(small.points, None, small.mask), k=neighbors), need
+
+
+def align(
+    source: PointCloud,
+    target: PointCloud,
+    voxel_size: Float[Array, ""],
+    init,
+    rooms: tuple[int | None, ...],
+    pyramid: Pyramid,
+) -> Registration:
+    """The alignment of the levels, each started from the one before.
+
+    Both clouds have the same size; `rooms` is the capacity of every level, or None.
+    """
+    pair = jax.tree.map(lambda a, b: jnp.stack([a, b]), source, target)
+    steps, overflow = jnp.zeros((), jnp.int32), jnp.asarray(False)
+    for i, room in enumerate(rooms):
+        side = _after(pyramid.voxels[i] * voxel_size, steps)
+        # One after the other: XLA on the CPU may run independent loops at once, and
+        # then wait forever for threads that wait for each other.
+        level = partial(make_level, side=side, room=room, neighbors=pyramid.neighbors)
+        small, need = jax.lax.map(level, pair)
+        if room is not None:
+            overflow = overflow | jnp.any(need > room)
+        found = icp(
+            *(jax.tree.map(lambda x, j=j: x[j], small) for j in (0, 1)),
+            init=init,
+            method=pyramid.method,
+            max_distance=pyramid.gates[i] * voxel_size,
+            max_steps=pyramid.max_steps,
+        )
+        init, steps = found.target_from_source, steps + found.num_steps
+    result = first_failure(
+        failure_where(overflow, RESULTS.capacity_exceeded), found.result
+    )
+    where = lambda r: (r.num_steps, r.result)
+    return eqx.tree_at(where, found, (steps, result))
+
+
+def _after(value, steps):
+    """`value`, but only once `steps` (never negative) is known."""
+    return jnp.where(steps < 0, jnp.nan, value)
+
+
+def occupied(points: Float[Array, "n 3"], side: float) -> int:
+    """The number of voxels of a given side that hold points (host)."""
+    cell = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
+    spans = cell.max(axis=0) + 1
+    key = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
+    return int(np.unique(key).size)
+
+
+def rooms_for(clouds, voxel_size: float, pyramid: Pyramid) -> tuple[int | None, ...]:
+    """The capacity of every level for all given arrays of points (host)."""
+    need = lambda points, side: min(len(points), occupied(points, side) + _SLACK)
+    return tuple(
+        bucket(max(need(points, share * voxel_size) for points in clouds))
+        if share
+        else None
+        for share in pyramid.voxels
+    )
+
+
+def choose_voxel_size(points, per_voxel: float = 2.0) -> float:
+    """The voxel side at which a voxel with points holds `per_voxel` on average (host).
+
+    On a surface the number of voxels grows with the inverse square of the side.
+    """
+    wanted = max(len(points) / per_voxel, 1)
+    side = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) / 32
+    for _ in range(4):
+        side = side * float(np.sqrt(occupied(points, side) / wanted))
+    return side

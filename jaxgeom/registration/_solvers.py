@@ -1,0 +1,214 @@
+"""How the cost at fixed pairs is made smaller: one step of an alignment."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from .._core import GeometryError, message
+from ..transforms import Affine, Rigid, Similarity, procrustes
+from ._models import RigidModel, SimilarityModel
+from ._objectives import PointToPoint
+from ._problem import Problem
+
+_MOST_DAMPING = 1e6
+
+
+class Step(eqx.Module):
+    """A move of the source about the center of the target, and the next damping."""
+
+    transform: Rigid | Similarity | Affine
+    damping: Float[Array, ""]
+
+
+class AbstractSolver(eqx.Module):
+    """The choice of a solver for the problem between two searches for pairs."""
+
+    @abstractmethod
+    def start(self) -> float:
+        """The damping of the first step."""
+
+    @abstractmethod
+    def step(self, problem: Problem, damping: Float[Array, ""]) -> Step:
+        """The move that makes the cost at the given pairs smaller."""
+
+    @abstractmethod
+    def validate(self, objective, model) -> None:
+        """Raise `GeometryError` for what the solver cannot do."""
+
+
+class GaussNewton(AbstractSolver):
+    """(H + damping diag H) z = -g with the weights rho' of the robust kernel.
+
+    H = sum w J^T J is summed as one product of an array [k+1, n] with its transpose,
+    and solved by Cholesky.
+    """
+
+    damping: float = 1e-6
+
+    def start(self):
+        return self.damping
+
+    def validate(self, objective, model):
+        pass
+
+    def step(self, problem, damping):
+        z = _solve(problem, damping)
+        return Step(problem.model.exp(problem.tangent.basis @ z), damping)
+
+
+class LevenbergMarquardt(AbstractSolver):
+    """Gauss-Newton steps whose damping grows until the cost at the pairs falls.
+
+    A step that raises the cost is not taken, and the next one is damped `factor` times
+    more; after a good one the damping falls as much, not below `least`.
+    """
+
+    least: float = 1e-6
+    factor: float = 10.0
+
+    def start(self):
+        return self.least
+
+    def validate(self, objective, model):
+        pass
+
+    def step(self, problem, damping):
+        equations = problem.normal_equations()
+
+        def attempt(carry):
+            _, damping, _ = carry
+            z = _damped(equations, damping)
+            worse = ~(problem.energy(z) <= equations.energy * (1 + _slack(z)))
+            return z, jnp.where(worse, self.factor * damping, damping), worse
+
+        going = lambda carry: carry[2] & (carry[1] < _MOST_DAMPING)
+        zero = jnp.zeros_like(equations.gradient)
+        z, damping, worse = jax.lax.while_loop(
+            going, attempt, (zero, damping, jnp.asarray(True))
+        )
+        z = jnp.where(worse, 0, z)
+        damping = jnp.maximum(damping / self.factor, self.least)
+        return Step(problem.model.exp(problem.tangent.basis @ z), damping)
+
+
+class Alternation(AbstractSolver):
+    """The closed-form Procrustes fit to the pairs, with the weights rho'.
+
+    For `PointToPoint` and rigid or similarity models without locked directions.
+    """
+
+    def start(self):
+        return 0.0
+
+    def validate(self, objective, model):
+        free = model.basis is None and model.prior is None
+        kind = isinstance(model, RigidModel | SimilarityModel)
+        if not (isinstance(objective, PointToPoint) and free and kind):
+            raise GeometryError(
+                message(
+                    "Alternation fits points to points with a free rigid or "
+                    "similarity model",
+                    f"{type(objective).__name__} with {type(model).__name__}",
+                    "Use GaussNewton or LevenbergMarquardt.",
+                )
+            )
+
+    def step(self, problem, damping):
+        zero = jnp.zeros(problem.size, problem.points.dtype)
+        weights = problem.robust_weights(problem.residuals(zero))
+        fit = procrustes(
+            problem.points.T,
+            problem.there.T,
+            weights,
+            scaling=isinstance(problem.model, SimilarityModel),
+        )
+        return Step(fit.transform, damping)
+
+
+class LeastSquares(AbstractSolver):
+    """Any least-squares solver of optimistix on the rows sqrt(w rho(s) / s) r.
+
+    Such as `optimistix.Dogleg(rtol=1e-6, atol=1e-6)`.
+    """
+
+    solver: optx.AbstractLeastSquaresSolver
+    max_steps: int = 8
+
+    def start(self):
+        return 0.0
+
+    def validate(self, objective, model):
+        pass
+
+    def step(self, problem, damping):
+        zero = jnp.zeros(problem.size, problem.points.dtype)
+        found = optx.least_squares(
+            lambda z, problem: problem.rescaled(z),
+            *(self.solver, zero, problem),
+            max_steps=self.max_steps,
+            throw=False,
+        )
+        return _unless_worse(problem, found.value, damping)
+
+
+class Minimise(AbstractSolver):
+    """Any minimiser of optimistix on the cost, in units of the cost at the start.
+
+    Such as `optimistix.BFGS(rtol=1e-6, atol=1e-6)` or `optimistix.GradientDescent`.
+    """
+
+    solver: optx.AbstractMinimiser
+    max_steps: int = 32
+
+    def start(self):
+        return 0.0
+
+    def validate(self, objective, model):
+        pass
+
+    def step(self, problem, damping):
+        zero = jnp.zeros(problem.size, problem.points.dtype)
+        # The trace of H makes steps of order one out of slopes in any unit.
+        unit = jnp.trace(problem.normal_equations().matrix) / problem.size
+        unit = jnp.where(unit > 0, unit, 1)
+        found = optx.minimise(
+            lambda z, problem: problem.energy(z) / unit,
+            *(self.solver, zero, problem),
+            max_steps=self.max_steps,
+            throw=False,
+        )
+        return _unless_worse(problem, found.value, damping)
+
+
+def _unless_worse(problem, z, damping) -> Step:
+    """A solver cut short may end anywhere: only a move that lowers the cost is made."""
+    zero = jnp.zeros_like(z)
+    better = problem.energy(z) < problem.energy(zero)
+    z = jnp.where(better, z, zero)
+    return Step(problem.model.exp(problem.tangent.basis @ z), damping)
+
+
+def _slack(z):
+    """The relative rounding of a sum over all pairs."""
+    return 64 * jnp.finfo(z.dtype).eps
+
+
+def _solve(problem, damping):
+    return _damped(problem.normal_equations(), damping)
+
+
+def _damped(equations, damping):
+    """The damped step; directions that no pair speaks of stay still."""
+    diagonal = jnp.diagonal(equations.matrix)
+    peak = jnp.max(diagonal)
+    eps = jnp.finfo(diagonal.dtype).eps
+    # Below rounding a pivot could turn negative.
+    floor = jnp.where(peak > 0, 16 * eps * peak, 1)
+    lifted = equations.matrix + jnp.diag(damping * diagonal + floor)
+    factor = jax.scipy.linalg.cho_factor(lifted, lower=True)
+    z = -jax.scipy.linalg.cho_solve(factor, equations.gradient)
+    return jnp.where(jnp.all(jnp.isfinite(z)), z, 0)
