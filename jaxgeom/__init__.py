@@ -38,6 +38,7 @@ _NAMES = {
     "generalized_procrustes": "transforms",
     "interpolate": "transforms",
     "Fusion": "pipelines",
+    "find_start": "pipelines",
     "fuse": "pipelines",
     "Reconstruction": "pipelines",
     "reconstruct": "pipelines",

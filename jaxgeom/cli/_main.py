@@ -19,7 +19,8 @@ _EPILOG = """exit codes: 0 ok, 1 internal error, 2 usage, 3 file, 4 bad data,
 def main(argv: list[str] | None = None) -> int:
     """Run one command and return its exit code."""
     arguments = _parser().parse_args(argv)
-    module = importlib.import_module(f"._{arguments.command}", __package__)
+    name = arguments.command.replace("-", "_")
+    module = importlib.import_module(f"._{name}", __package__)
     _use_compile_cache()
     from .._core import GeometryError
     from ..io import FileError
@@ -69,6 +70,8 @@ def _parser():
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_demo(commands)
     _add_reconstruct(commands)
+    _add_register(commands)
+    _add_register_many(commands)
     _add_fuse(commands)
     _add_info(commands)
     _add_pictures(commands)
@@ -132,6 +135,66 @@ def _add_surface(command):
     command.add_argument("--report", metavar="JSON", help="parameters, sizes, statuses")
 
 
+def _add_register(commands):
+    command = commands.add_parser(
+        "register", help="the motion that lays one scan on another; prints it"
+    )
+    command.add_argument("source", metavar="SOURCE", help="the scan that is moved")
+    command.add_argument("target", metavar="TARGET", help="the scan that stays")
+    command.add_argument("-o", "--output", metavar="FILE", help="write the moved scan")
+    start = command.add_mutually_exclusive_group()
+    start.add_argument(
+        "--init", metavar="FILE", help="a text file with the 4 x 4 matrix to start from"
+    )
+    start.add_argument(
+        "--mean", action="store_true", help="start with the centers on each other"
+    )
+    start.add_argument(
+        "--global",
+        dest="find_start",
+        action="store_true",
+        help="find a start from features",
+    )
+    command.add_argument("--seed", type=int, default=0, help="for --global (0)")
+    _add_alignment(command)
+
+
+def _add_register_many(commands):
+    command = commands.add_parser(
+        "register-many", help="lay many scans on one, in one compiled call"
+    )
+    command.add_argument("target", metavar="TARGET", help="the scan that stays")
+    command.add_argument("sources", nargs="+", metavar="SCAN")
+    _add_alignment(command)
+
+
+def _add_alignment(command):
+    """The options of both commands that align scans."""
+    command.add_argument(
+        "--objective",
+        choices=("point-to-point", "point-to-plane", "symmetric", "generalized"),
+        default="symmetric",
+    )
+    command.add_argument(
+        "--kernel",
+        choices=("l2", "huber", "cauchy", "geman-mcclure", "tukey", "welsch"),
+        default="tukey",
+    )
+    command.add_argument(
+        "--max-correspondence-distance",
+        type=_distance,
+        metavar="D",
+        help="at the finest level: a length, or 2%% of the target's diagonal",
+    )
+    command.add_argument(
+        "--voxel-size", type=_positive, metavar="V", help="of the finest level"
+    )
+    command.add_argument("--with-scale", action="store_true", help="also find a scale")
+    command.add_argument(
+        "--report", metavar="JSON", help="transforms, errors, statuses"
+    )
+
+
 def _add_fuse(commands):
     command = commands.add_parser(
         "fuse", help="align several scans of one object and make one mesh of them"
@@ -169,6 +232,13 @@ def _add_pictures(commands):
             command.add_argument("--size", type=int, default=800, help="pixels (800)")
             command.add_argument("--azimuth", type=float, default=-60.0)
             command.add_argument("--elevation", type=float, default=20.0)
+
+
+def _distance(text):
+    """A length, or a share of a size as the negative of a percentage."""
+    percent = text.endswith("%")
+    value = _positive(text.rstrip("%"))
+    return -value / 100 if percent else value
 
 
 def _number(kind, low, high, what):

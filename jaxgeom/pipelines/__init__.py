@@ -1,10 +1,12 @@
 """The doors: whole pipelines, in a host form and a compiled form."""
 
+from ._find_start import find_start as find_start
 from ._fuse import Fusion as Fusion
 from ._fuse import fuse as fuse
 from ._memory import memory_needed as memory_needed
 from ._prepare import prepare as prepare
 from ._pyramid import Pyramid as Pyramid
+from ._pyramid import choose_voxel_size as choose_voxel_size
 from ._reconstruct import Reconstruction as Reconstruction
 from ._reconstruct import reconstruct as reconstruct
 from ._reconstruct import reconstruct_jit as reconstruct_jit

@@ -4,19 +4,16 @@ from collections.abc import Sequence
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
 from .._core import RESULTS, GeometryError, bucket, first_failure, message
-from ..normals import estimate, orient_consistently, orient_toward_viewpoint
 from ..registration import MultiView, match_views, multiview, spanning_poses
-from ..shapes import PointCloud, stack
+from ..shapes import PointCloud
 from ..transforms import Rigid
-from ._prepare import check_points
+from ._frames import Frames, checked, oriented
 from ._reconstruct import Reconstruction, reconstruct
 
-_NEIGHBORS = 16
 # The side of a voxel as a share of the longest side of a scan, and of the features'.
 _FINE, _COARSE = 1 / 160, 4.0
 
@@ -73,13 +70,13 @@ def fuse(
 
     **Statuses:** those of `multiview` and `reconstruct`.
     """
-    scans = [_checked(scan, i) for i, scan in enumerate(scans)]
+    scans = [checked(scan, i) for i, scan in enumerate(scans)]
     if len(scans) < 2:
         raise GeometryError(
             message("fuse needs at least two scans", f"{len(scans)}", "Add scans.")
         )
-    frames = _Frames.of(scans)
-    batch, notes = _oriented(frames.to_unit(scans), frames.viewpoints(viewpoints))
+    frames = Frames.of(scans)
+    batch, notes = oriented(frames.to_unit(scans), frames.viewpoints(viewpoints))
     fine = _FINE if voxel_size is None else voxel_size / frames.scale
     key = jax.random.key(0) if key is None else key
     if start is None:
@@ -100,103 +97,6 @@ def fuse(
     )
     result = first_failure(views.result, out.result)
     return Fusion(poses, cloud, out, views, result, notes + out.notes)
-
-
-class _Frames(eqx.Module):
-    """x_user = scale x_unit + center, with a center for every scan (float64)."""
-
-    centers: np.ndarray
-    scale: float
-
-    @staticmethod
-    def of(scans) -> "_Frames":
-        points = [np.asarray(scan.points, np.float64) for scan in scans]
-        ends = np.array([[x.min(axis=0), x.max(axis=0)] for x in points])
-        scale = float(np.median(np.max(ends[:, 1] - ends[:, 0], axis=1)))
-        if scale == 0:
-            raise GeometryError(
-                message(
-                    "scans must have an extent",
-                    "scans whose points all coincide",
-                    "Check the units and the columns of the files.",
-                )
-            )
-        return _Frames(ends.mean(axis=1), scale)
-
-    def to_unit(self, scans) -> PointCloud:
-        """The stacked scans about the origin, with side about one."""
-        dtype = jnp.zeros(()).dtype
-        unit = [
-            PointCloud(
-                ((np.asarray(s.points, np.float64) - c) / self.scale).astype(dtype),
-                None if s.normals is None else np.asarray(s.normals, dtype),
-            )
-            for s, c in zip(scans, self.centers, strict=True)
-        ]
-        return stack(unit)
-
-    def viewpoints(self, viewpoints):
-        """Scanner positions [b, 3] in the unit frames, or None."""
-        if viewpoints is None:
-            return None
-        given = np.broadcast_to(np.asarray(viewpoints, np.float64), self.centers.shape)
-        return (given - self.centers) / self.scale
-
-    def user_poses(self, poses) -> Rigid:
-        """c_0 + s (R (x - c_i) / s + t), with the first scan's frame as the world."""
-        turn = _orthonormal(np.asarray(poses.rotation, np.float64))
-        shift = self.centers[0] + self.scale * np.asarray(poses.translation, np.float64)
-        return Rigid(turn, shift - np.einsum("bij,bj->bi", turn, self.centers))
-
-    def unit_poses(self, poses) -> Rigid:
-        """The inverse of `user_poses`, relative to the first scan."""
-        turn = np.asarray(poses.rotation, np.float64)
-        shift = np.asarray(poses.translation, np.float64)
-        middle = np.einsum("bij,bj->bi", turn, self.centers) + shift
-        shift = ((middle - shift[0]) @ turn[0] - self.centers[0]) / self.scale
-        dtype = jnp.zeros(()).dtype
-        turn = np.einsum("ji,bjk->bik", turn[0], turn)
-        return Rigid(jnp.asarray(turn, dtype), jnp.asarray(shift, dtype))
-
-
-def _orthonormal(matrices):
-    """Single-precision rotations made orthonormal in double precision."""
-    u, _, v = np.linalg.svd(matrices)
-    return u @ v
-
-
-def _checked(scan, number):
-    scan = scan if isinstance(scan, PointCloud) else PointCloud(scan)
-    scan = scan.trim()
-    try:
-        check_points(scan.points)
-    except GeometryError as error:
-        raise GeometryError(f"scan {number}: {error}") from None
-    return scan
-
-
-@eqx.filter_jit
-def _with_estimates(batch, viewpoints):
-    def one(cloud, viewpoint):
-        cloud = estimate(cloud, k=_NEIGHBORS)
-        if viewpoint is None:
-            return orient_consistently(cloud)
-        return orient_toward_viewpoint(cloud, viewpoint)
-
-    if viewpoints is None:
-        return jax.lax.map(lambda cloud: one(cloud, None), batch)
-    return jax.lax.map(lambda pair: one(*pair), (batch, viewpoints))
-
-
-def _oriented(batch, viewpoints):
-    batch = jax.tree.map(jnp.asarray, batch)
-    if batch.normals is not None:
-        return batch, ()
-    if viewpoints is None:
-        note = "normals were estimated and oriented outward, without a viewpoint"
-        return _with_estimates(batch, None), (note,)
-    batch = _with_estimates(batch, jnp.asarray(viewpoints, batch.points.dtype))
-    return batch, ("normals were estimated and oriented toward the viewpoints",)
 
 
 @eqx.filter_jit
