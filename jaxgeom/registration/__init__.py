@@ -63,6 +63,7 @@ from ._solvers import GaussNewton as GaussNewton
 from ._solvers import LeastSquares as LeastSquares
 from ._solvers import LevenbergMarquardt as LevenbergMarquardt
 from ._solvers import Minimise as Minimise
+from ._starts import icp_from_many as icp_from_many
 from ._stiffness import AsRigidAsPossible as AsRigidAsPossible
 from ._stiffness import PerVertexAffine as PerVertexAffine
 from ._stiffness import StiffnessSchedule as StiffnessSchedule

@@ -4,3 +4,4 @@ from ._cloud import PointCloud as PointCloud
 from ._cloud import stack as stack
 from ._grid import Grid as Grid
 from ._mesh import TriangleMesh as TriangleMesh
+from ._subsample import subsample as subsample
