@@ -14,7 +14,11 @@ from jaxgeom.isosurface import (
     marching_cubes,
 )
 
-SHAPES = [(9, 7, 11), (2, 2, 2), (2, 5, 33), (4, 3, 300), (270, 3, 4), (5, 6, 64)]
+# Each shape compiles its own programs: three of six are left to the slow run.
+_MORE = [(2, 5, 33), (270, 3, 4), (5, 6, 64)]
+SHAPES = [(9, 7, 11), (2, 2, 2), (4, 3, 300)] + [
+    pytest.param(shape, marks=pytest.mark.slow) for shape in _MORE
+]
 
 
 def noise(shape, seed=0):

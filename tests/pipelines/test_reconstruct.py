@@ -204,6 +204,7 @@ def test_real_statue_of_two_hundred_points(data):
     assert _closed(out) and int(out.topology.num_components) == 1
 
 
+@pytest.mark.slow
 def test_open_falcon_stays_open(data):
     mesh, cloud = _sampled(data / "meshes" / "falcon_open.ply", 20_000)
     side = float(np.ptp(cloud.points, axis=0).max())

@@ -127,6 +127,7 @@ def _scan(folder, name):
     return orient_toward_viewpoint(estimate(PointCloud(points, mask=mask)), far)
 
 
+@pytest.mark.slow
 def test_real_scans_without_a_pose(data):
     source, target = _scan(data, "bun045"), _scan(data, "bun000")
     # bun.conf; its quaternions turn the other way.
