@@ -65,9 +65,8 @@ def align(
     pair = jax.tree.map(lambda a, b: jnp.stack([a, b]), source, target)
     steps, overflow = jnp.zeros((), jnp.int32), jnp.asarray(False)
     for i, room in enumerate(rooms):
-        side = _after(pyramid.voxels[i] * voxel_size, steps)
-        # One after the other: XLA on the CPU may run independent loops at once, and
-        # then wait forever for threads that wait for each other.
+        side = pyramid.voxels[i] * voxel_size
+        # Both clouds in one loop: the program of a level is compiled once.
         level = partial(make_level, side=side, room=room, neighbors=pyramid.neighbors)
         small, need = jax.lax.map(level, pair)
         if room is not None:
@@ -85,11 +84,6 @@ def align(
     )
     where = lambda r: (r.num_steps, r.result)
     return eqx.tree_at(where, found, (steps, result))
-
-
-def _after(value, steps):
-    """`value`, but only once `steps` (never negative) is known."""
-    return jnp.where(steps < 0, jnp.nan, value)
 
 
 def occupied(points: Float[Array, "n 3"], side: float) -> int:

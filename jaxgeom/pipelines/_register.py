@@ -112,9 +112,11 @@ def register_many(
     - `chunk`: how many are aligned at once; memory grows with it. One at a time is
       fastest on a CPU.
 
-    Every item has its own status; none is ever raised.
+    Every item has its own status; none is ever raised. Raises `GeometryError` where the
+    shapes do not go together.
     """
     pyramid = Pyramid() if pyramid is None else pyramid
+    _check_batches(sources, target)
     b = sources.points.shape[0]
     if target.points.ndim == 2:
         target = jax.tree.map(lambda x: np.broadcast_to(x, (b, *x.shape)), target)
@@ -138,6 +140,20 @@ def register_many(
 
 
 _run = eqx.filter_jit(align)
+
+
+def _check_batches(sources, target):
+    """Raise for sources that are no batch, and for another number of targets."""
+    b, shape = sources.points.shape[0], target.points.shape
+    if sources.points.ndim == 3 and (len(shape) == 2 or shape[0] == b):
+        return
+    raise GeometryError(
+        message(
+            "sources must be a batch [b, n, 3], and target one cloud or b of them",
+            f"sources {tuple(sources.points.shape)}, target {tuple(shape)}",
+            "Make batches with stack.",
+        )
+    )
 
 
 @eqx.filter_jit

@@ -51,8 +51,11 @@ class Registration(eqx.Module):
     - `num_matches`, `num_steps`: pairs at the end, searches made.
     - `width`: of the kernel at the end.
     - `information`: [dof, dof] = sum w rho' J^T J for tangent vectors about the origin.
-      Over rmse^2 it is the inverse covariance of the pose.
     - `scatter`: [dof, dof] = sum (w rho' J^T r)(...)^T, for the sandwich form.
+    - `noise`: standard deviation of one residual, as the weighted rows have it:
+      sqrt(sum w rho'^2 r^2 / sum w rho').
+    - `sharpness`: the second derivative of the kernel over its weight, mean over the
+      pairs: sum w (rho' + 2 s rho'') / sum w rho'. One for `L2`, smaller for others.
     - `degeneracy`: its eigenvalues and the moves they belong to.
     - `history`: [max_steps] costs, infinite after the last step; None if not asked for.
     """
@@ -67,6 +70,8 @@ class Registration(eqx.Module):
     width: Float[Array, ""]
     information: Float[Array, "dof dof"]
     scatter: Float[Array, "dof dof"]
+    noise: Float[Array, ""]
+    sharpness: Float[Array, ""]
     degeneracy: Degeneracy
     history: Float[Array, " steps"] | None
 
@@ -360,7 +365,10 @@ def _report(scene, problem, pose, state, min_matches) -> Registration:
     values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(matrix))
     directions = (scene.tangent.about_origin @ vectors).T
     count = jnp.sum(problem.weights > 0)
-    square = safe_divide(jnp.sum(robust * jnp.sum(rows**2, axis=0)), jnp.sum(robust))
+    squares, total = jnp.sum(rows**2, axis=0), jnp.sum(robust)
+    square = safe_divide(jnp.sum(robust * squares), total)
+    pull = safe_divide(robust, problem.weights)
+    noise = _root(safe_divide(jnp.sum(robust * pull * squares), total))
     gaps = jnp.sum(problem.weights * (problem.points - problem.there) ** 2)
     fitness = safe_divide(jnp.sum(problem.weights), jnp.sum(scene.weights))
     eps = jnp.finfo(values.dtype).eps
@@ -382,6 +390,8 @@ def _report(scene, problem, pose, state, min_matches) -> Registration:
         width=problem.width,
         information=outward(matrix),
         scatter=outward(scatter),
+        noise=noise,
+        sharpness=safe_divide(jnp.sum(problem.curvatures(rows)), total),
         degeneracy=Degeneracy(values, directions),
         history=state.history,
     )

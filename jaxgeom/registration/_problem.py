@@ -98,6 +98,12 @@ class Problem(eqx.Module):
             jnp.sum(rows**2, axis=0) / self.width**2
         )
 
+    def curvatures(self, rows: Float[Array, "r n"]) -> Float[Array, " n"]:
+        """w_i (rho' + 2 s rho'' / r): the second derivatives by a row, their mean."""
+        s = jnp.sum(rows**2, axis=0) / self.width**2
+        weight, slope = jax.jvp(self.kernel.weight, (s,), (jnp.ones_like(s),))
+        return self.weights * (weight + 2 * s * slope / rows.shape[0])
+
     def normal_equations(self) -> Normals:
         """Gauss-Newton at z = 0 with the weights rho'."""
         rows, slopes = self.linearized()

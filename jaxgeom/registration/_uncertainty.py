@@ -10,23 +10,28 @@ from ._icp import Registration
 def pose_covariance(found: Registration) -> Float[Array, "dof dof"]:
     """sigma^2 H^-1: the covariance of the tangent vector from the truth to the pose.
 
-    sigma^2 is the variance of the residuals with the weights of the kernel, H the
-    information matrix (Laplace's approximation). Residuals are taken for independent.
-    Tangent vectors are about the origin: rotation vector in radians, then translation.
+    H is the information matrix (Laplace's approximation) and sigma = noise / sharpness:
+    the weights of a kernel make both the pull and the stiffness of a pair smaller, as
+    in Huber's formula sigma^2 = mean(psi^2) / mean(psi')^2. Residuals are taken for
+    independent and alike. For `Trimmed`, whose pull jumps, it is too small. Tangent
+    vectors are about the origin: rotation vector in radians, then translation.
+
+    Source: Huber 1981, Robust statistics, 7.6.
     """
     count = found.num_matches.astype(found.rmse.dtype)
     dof = found.information.shape[0]
     effective = jnp.maximum(count - dof, 1)
-    return found.rmse**2 * safe_divide(count, effective) * _inverse(found.information)
+    sigma = safe_divide(found.noise, found.sharpness)
+    return sigma**2 * safe_divide(count, effective) * _inverse(found.information)
 
 
 def sandwich_covariance(found: Registration) -> Float[Array, "dof dof"]:
-    """H^-1 M H^-1 with M = sum (w rho' J^T r)(w rho' J^T r)^T.
+    """B M B with M = sum (w rho' J^T r)(w rho' J^T r)^T, B = H^-1 / sharpness.
 
     Holds also where the noise differs from pair to pair. Source: Huber 1967; White
     1980.
     """
-    back = _inverse(found.information)
+    back = safe_divide(_inverse(found.information), found.sharpness)
     return back @ found.scatter @ back
 
 

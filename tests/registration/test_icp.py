@@ -46,14 +46,22 @@ MOVE = np.array([0.06, -0.09, 0.05, 0.05, -0.04, 0.03])
 
 
 def _surface(n, seed):
-    """Points of a bumpy ellipsoid off the origin, with normals."""
+    """Points of a bumpy ellipsoid off the origin, with the normals of its bumps.
+
+    Normals of the plain ellipsoid would leave affine maps of it to itself free.
+    """
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(n, 3))
     x = x / np.linalg.norm(x, axis=1, keepdims=True)
     axes = np.array([1.0, 0.7, 0.5])
-    bump = 1 + 0.1 * np.sin(3 * x[:, :1]) * np.cos(2 * x[:, 1:2])
-    points = x * axes * bump + [0.4, -0.3, 0.8]
-    normals = x / axes
+    a, b = 3 * x[:, 0], 2 * x[:, 1]
+    bump = 1 + 0.1 * np.sin(a) * np.cos(b)
+    points = x * axes * bump[:, None] + [0.4, -0.3, 0.8]
+    # The surface is |u| = bump(u / |u|) with u = point / axes.
+    slope = 0.1 * np.stack([3 * np.cos(a) * np.cos(b), -2 * np.sin(a) * np.sin(b)], 1)
+    slope = np.pad(slope, ((0, 0), (0, 1)))
+    slope = slope - np.sum(slope * x, axis=1, keepdims=True) * x
+    normals = (x - slope / bump[:, None]) / axes
     normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     return points, normals
 
@@ -106,16 +114,18 @@ SOLVERS = [
 def test_every_composition_finds_the_motion(method):
     source, target = _pair()
     found = align(source, target, method=method, max_steps=100)
-    assert _off(found) < 2e-3
+    # To trim a fifth of Gaussian residuals makes the variance 1 / 0.35 times larger.
+    loss = 0.35**-0.5 if isinstance(method.kernel, Trimmed) else 1
+    assert _off(found) < 2e-3 * loss
     assert int(found.num_matches) >= 0.6 * N
     assert np.linalg.det(found.target_from_source.rotation) > 0
 
 
-@pytest.mark.xfail(strict=True, reason="open: an affine fit ends far away here")
 def test_affine_maps_are_found():
     source, target = _pair()
     found = align(source, target, method=Method(model=AffineModel()), max_steps=100)
-    assert isinstance(found.target_from_source, Affine) and _off(found) < 1e-2
+    assert found.result == RESULTS.successful
+    assert isinstance(found.target_from_source, Affine) and _off(found) < 4e-3
 
 
 def test_scale_is_found():
