@@ -238,7 +238,8 @@ def covariance(draws=500, count=2000, noise=3e-4):
 
         def draw(key):
             noisy = source + noise * jax.random.normal(key, source.shape)
-            found = icp(PointCloud(noisy), index, init=truth, rtol=1e-6)
+            near = dict(max_distance=10 * noise, rtol=1e-6)
+            found = icp(PointCloud(noisy), index, init=truth, **near)
             error = (found.target_from_source @ truth.inverse()).log()
             return error, (pose_covariance(found), sandwich_covariance(found))
 
