@@ -11,9 +11,7 @@ import argparse
 import os
 import pathlib
 import time
-from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,10 +23,7 @@ from scipy.stats import chi2
 from jaxgeom import PointCloud, Rigid, normals, stack
 from jaxgeom.pipelines import MeanAligned, register, register_many
 from jaxgeom.registration import (
-    Method,
     Nearest,
-    PointToPoint,
-    Welsch,
     icp,
     pose_covariance,
     prepare_target,
@@ -184,22 +179,12 @@ def lidar():
 
 
 def fricp():
-    """From the mean-aligned start; then polished by the objective of the reference."""
+    """From the mean-aligned start."""
     folder = DATA / "fricp"
     source, target = (vertices(folder / f"{n}.ply") for n in ("source", "target"))
     truth = np.loadtxt(folder / "m3trans.txt")
     found = register(source, target, init=MeanAligned(), throw=False)
     report("fricp", found, truth, source, "0.01 deg", 1)
-    # m3trans is the minimum of a Welsch cost of point-to-point distances, whose width
-    # ends at the mean distance of neighbors over 3 sqrt(3) (Zhang, Yao, Deng 2021).
-    far = cKDTree(target).query(target, 7)[0][:, 1:]
-    width = float(np.mean(np.median(far, axis=1))) / (3 * np.sqrt(3))
-    points = Method(objective=PointToPoint(), kernel=Welsch(width))
-    with jax.enable_x64(True):
-        start = jax.tree.map(jnp.asarray, found.target_from_source)
-        polish = eqx.filter_jit(partial(icp, method=points, rtol=1e-8, max_steps=500))
-        found = polish(PointCloud(source), PointCloud(target), init=start)
-    report("fricp, points", found, truth, source, "0.01 deg", 1)
 
 
 def split():
@@ -238,7 +223,8 @@ def covariance(draws=500, count=2000, noise=3e-4):
 
         def draw(key):
             noisy = source + noise * jax.random.normal(key, source.shape)
-            found = icp(PointCloud(noisy), index, init=truth, rtol=1e-6)
+            near = dict(max_distance=10 * noise, rtol=1e-6)
+            found = icp(PointCloud(noisy), index, init=truth, **near)
             error = (found.target_from_source @ truth.inverse()).log()
             return error, (pose_covariance(found), sandwich_covariance(found))
 

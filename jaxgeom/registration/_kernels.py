@@ -148,8 +148,10 @@ class Tukey(AbstractKernel):
     width: AbstractWidth = eqx.field(converter=_as_width, default=deviation_width())
 
     def rho(self, s):
-        rest = 1 - jnp.minimum(s, 1)
-        return (1 - rest**3) / 3
+        # Multiplied out: as a difference it is zero below rounding, where rho / s must
+        # stay near one.
+        s = jnp.minimum(s, 1)
+        return s * (1 - s + s**2 / 3)
 
 
 class Welsch(AbstractKernel):

@@ -51,6 +51,8 @@ def test_weight_is_the_slope_of_rho_over_r(kind, x64):
     np.testing.assert_allclose(kernel.weight(jnp.zeros(1)), 1)
     assert np.all(np.diff(weights) <= 0) and np.all(np.isfinite(weights))
     assert kernel.rho(jnp.zeros(())) == 0
+    tiny = jnp.asarray([1e-30, 1e-12], jnp.float32)
+    np.testing.assert_allclose(kernel.rho(tiny) / tiny, 1, rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", KERNELS)
