@@ -7,6 +7,7 @@ from ._memory import memory_needed as memory_needed
 from ._prepare import prepare as prepare
 from ._pyramid import Pyramid as Pyramid
 from ._pyramid import choose_voxel_size as choose_voxel_size
+from ._pyramid import level_rooms as level_rooms
 from ._reconstruct import Reconstruction as Reconstruction
 from ._reconstruct import reconstruct as reconstruct
 from ._reconstruct import reconstruct_jit as reconstruct_jit

@@ -1,5 +1,6 @@
 """Coarse to fine: thinned clouds with normals, and how far pairs may be apart."""
 
+import dataclasses
 from functools import partial
 
 import equinox as eqx
@@ -21,6 +22,8 @@ from ..shapes import PointCloud
 
 # Single precision may put a few points on the far side of the border of a voxel.
 _SLACK = 32
+# A level with fewer points than this says more of its voxels than of the surface.
+_SPARSE = 64
 
 
 class Pyramid(eqx.Module):
@@ -94,7 +97,25 @@ def occupied(points: Float[Array, "n 3"], side: float) -> int:
     return int(np.unique(key).size)
 
 
-def rooms_for(clouds, voxel_size: float, pyramid: Pyramid) -> tuple[int | None, ...]:
+def without_sparse_levels(clouds, voxel_size: float, pyramid: Pyramid) -> Pyramid:
+    """The pyramid without coarse levels on which half of the clouds have few voxels.
+
+    The finest level always stays (host).
+    """
+
+    def dense(share):
+        counts = [occupied(points, share * voxel_size) for points in clouds]
+        return np.median(counts) >= _SPARSE
+
+    last = len(pyramid.voxels) - 1
+    kept = [i for i, v in enumerate(pyramid.voxels) if i == last or not v or dense(v)]
+    pick = lambda values: tuple(values[i] for i in kept)
+    return dataclasses.replace(
+        pyramid, voxels=pick(pyramid.voxels), gates=pick(pyramid.gates)
+    )
+
+
+def level_rooms(clouds, voxel_size: float, pyramid: Pyramid) -> tuple[int | None, ...]:
     """The capacity of every level for all given arrays of points (host)."""
     need = lambda points, side: min(len(points), occupied(points, side) + _SLACK)
     return tuple(

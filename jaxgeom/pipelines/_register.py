@@ -10,7 +10,13 @@ from .._core import RESULTS, GeometryError, bucket, message
 from ..registration import Registration
 from ..shapes import PointCloud
 from ..transforms import Affine, Rigid, Similarity
-from ._pyramid import Pyramid, align, choose_voxel_size, rooms_for
+from ._pyramid import (
+    Pyramid,
+    align,
+    choose_voxel_size,
+    level_rooms,
+    without_sparse_levels,
+)
 
 _FEWEST = 6
 
@@ -42,7 +48,7 @@ def register(
     - `voxel_size`: side of the finest voxels; by default such that a voxel with points
       holds two on average.
     - `init`: the transform to start from (identity by default), or `MeanAligned()`.
-    - `pyramid`: levels and method.
+    - `pyramid`: levels and method; coarse levels with few points are left out.
     - `throw`: raise `GeometryError` for a status that is not success.
 
     The transform is in double precision. **Statuses:** those of `icp`, for the finest
@@ -57,7 +63,8 @@ def register(
     start = _start(init, *points, center)
     pair = _padded(clouds, points)
     dtype = pair[0].points.dtype
-    rooms = rooms_for(points, voxel_size, pyramid)
+    pyramid = without_sparse_levels(points, voxel_size, pyramid)
+    rooms = level_rooms(points, voxel_size, pyramid)
     found = _run(
         *pair, jnp.asarray(voxel_size, dtype), _as(start, dtype), rooms, pyramid
     )
@@ -125,7 +132,9 @@ def register_many(
     some = [points for points in rows if len(points)]
     if voxel_size is None:
         voxel_size = float(np.median([choose_voxel_size(p) for p in some] or [1.0]))
-    rooms = rooms_for(some or [np.zeros((1, 3))], voxel_size, pyramid)
+    some = some or [np.zeros((1, 3))]
+    pyramid = without_sparse_levels(some, voxel_size, pyramid)
+    rooms = level_rooms(some, voxel_size, pyramid)
     center = np.stack([_mean(points) for points in rows[b:]])
     start = _identities(b) if init is None else _as(init, np.float64)
     start = _conjugated(start, center)

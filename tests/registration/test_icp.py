@@ -97,9 +97,12 @@ SOLVERS = [
     Method(),
     Method(objective=Symmetric()),
     Method(objective=Generalized()),
+    Method(solver=LeastSquares(optx.Dogleg(rtol=1e-6, atol=1e-6))),
+]
+# Each composition is a program of its own, and takes seconds to compile.
+MORE_SOLVERS = [
     Method(solver=LevenbergMarquardt()),
     Method(objective=PointToPoint(), solver=Alternation()),
-    Method(solver=LeastSquares(optx.Dogleg(rtol=1e-6, atol=1e-6))),
     Method(solver=LeastSquares(optx.GaussNewton(rtol=1e-6, atol=1e-6))),
     Method(solver=Minimise(optx.BFGS(rtol=1e-6, atol=1e-6))),
     Method(correspondence=Mutual()),
@@ -108,6 +111,7 @@ SOLVERS = [
     Method(kernel=Trimmed(0.8)),
     Method(model=SimilarityModel()),
 ]
+SOLVERS += [pytest.param(m, marks=pytest.mark.slow) for m in MORE_SOLVERS]
 
 
 @pytest.mark.parametrize("method", SOLVERS, ids=lambda m: str(m)[:10])
