@@ -1,9 +1,10 @@
 """Exact neighbors by a cell list, with a certificate and a fallback.
 
-Points are sorted by cell. A query looks at the 2 x 2 x 2 cells around it: four runs of
-two cells, read as one list. What it finds is certainly right where the k-th distance is
-at most the distance to the boundary of these cells. The other queries (few, if the cell
-size suits the density) look at 4 x 4 x 4 cells, and what is left is searched in a tree.
+Points are sorted by cell. A query looks at the cells around it (2 x 2 x 2 for single
+neighbors, 3 x 3 x 3 smaller ones for many): runs of cells along z, read as one list.
+What it finds is certainly right where the k-th distance is at most the distance to the
+boundary of these cells. The other queries (few, if the cell size suits the density)
+look at a cube two cells wider, and what is left is searched in a tree.
 """
 
 import equinox as eqx
@@ -20,8 +21,8 @@ _LEAF = 8
 _LANES = 256
 # Queries of a tile of the second look.
 _FEW = 256
-# From here on it pays to sort queries by the length of their lists.
-_SORTED_FROM = 4
+# From so many neighbors on it pays to sort queries by the length of their lists.
+_MANY = 4
 _SMALLEST_TILE = 1024
 # Lists of k candidates per query of a tile should stay in the cache.
 _TILE_ENTRIES = 4096
@@ -43,6 +44,7 @@ class CellIndex(AbstractIndex):
     coordinates: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
     tree: Tree
     longest: int = eqx.field(static=True)
+    span: int = eqx.field(static=True)
 
     # Outside jit, control flow compiles what it closes over as constants, anew at
     # every call, and XLA spends most of a minute folding them.
@@ -82,7 +84,8 @@ class CellList(AbstractBackend):
         low, high = bounds(points, mask)
         order, coarse, fine = morton_order(points, mask, low, high)
         tree = grow(order, mask, points, points, _LEAF)
-        per_cell = max(4, 4 * self.neighbors // 3)
+        many = self.neighbors >= _MANY
+        per_cell = max(4, 3 * self.neighbors // 5) if many else 4
         width = _density_width(coarse, fine, mask[order], high - low, per_cell)
         table = _table_size(points.shape[0])
         width = _fitting_width(width, high - low, table)
@@ -97,6 +100,7 @@ class CellList(AbstractBackend):
         return CellIndex(
             *(given, real, low, high, width, counts, starts, order, soa, tree),
             longest=16 * per_cell,
+            span=3 if many else 2,
         )
 
 
@@ -139,12 +143,12 @@ def _cell_id(cell, counts):
 
 
 def _search_near(index, queries, active, k, reach) -> _Near:
-    """Every query in its 2 x 2 x 2 cells, those with lists of one length together."""
-    look = lambda rows: _search_cells(index, *rows, k, reach, 2)
+    """Every query in the cells around it, lists of similar length together."""
+    look = lambda rows: _search_cells(index, *rows, k, reach, index.span)
     size = max(_SMALLEST_TILE, _TILE_ENTRIES // k)
-    if k < _SORTED_FROM or queries.shape[0] <= size:
+    if k < _MANY or queries.shape[0] <= size:
         return in_tiles(look, (queries, active), size)
-    length = jnp.where(active, _block(index, queries, 2).total, 0)
+    length = jnp.where(active, _block(index, queries, index.span).total, 0)
     number = jnp.arange(queries.shape[0], dtype=jnp.int32)
     _, order = jax.lax.sort((length, number), num_keys=1)
     near = in_tiles(look, (queries[order], active[order]), size)
@@ -157,16 +161,14 @@ class _Block(eqx.Module):
 
     first: Int[Array, "t 3"]
     final: Int[Array, "t 3"]
-    ends: list[Int[Array, " t"]]
-    shifts: list[Int[Array, " t"]]
+    ends: Int[Array, "r t"]
+    shifts: Int[Array, "r t"]
     total: Int[Array, " t"]
 
     def position(self, j):
         """The place in cell order of number j of the list."""
-        position = j + self.shifts[0]
-        for end, shift in zip(self.ends[:-1], self.shifts[1:], strict=True):
-            position = jnp.where(j >= end, j + shift, position)
-        return position
+        run = sum((j >= end).astype(jnp.int32) for end in self.ends[:-1])
+        return j + self.shifts[run, jnp.arange(self.total.shape[0])]
 
 
 def _block(index, queries, span) -> _Block:
@@ -178,23 +180,22 @@ def _block(index, queries, span) -> _Block:
     corner = jnp.floor(safe - (span - 1) / 2)
     first = jnp.clip(corner, 0, jnp.maximum(last - (span - 1), 0)).astype(jnp.int32)
     final = jnp.minimum(first + (span - 1), index.counts - 1)
-    runs = []
-    for x in range(span):
-        for y in range(span):
-            cell = first[:, 0] + x, first[:, 1] + y
-            there = (cell[0] <= final[:, 0]) & (cell[1] <= final[:, 1])
-            row = jnp.where(there, _cell_id((*cell, 0), index.counts), 0)
-            start = starts[row + first[:, 2]]
-            stop = jnp.where(there, starts[row + final[:, 2] + 1], start)
-            runs.append((start, stop))
-    return _Block(first, final, *_chain(runs))
+    # The runs along z of the columns of cells, one row each.
+    x, y = jnp.divmod(jnp.arange(span**2, dtype=jnp.int32)[:, None], span)
+    cell = first[:, 0] + x, first[:, 1] + y
+    there = (cell[0] <= final[:, 0]) & (cell[1] <= final[:, 1])
+    row = jnp.where(there, _cell_id((*cell, 0), index.counts), 0)
+    begin = starts[row + first[:, 2]]
+    length = jnp.where(there, starts[row + final[:, 2] + 1] - begin, 0)
+    ends = jnp.cumsum(length, axis=0, dtype=jnp.int32)
+    return _Block(first, final, ends, begin + length - ends, ends[-1])
 
 
 def _search_cells(index, queries, active, k, reach, span) -> _Near:
     """The k nearest in the cube of `span`^3 cells around each query."""
     n = index.points.shape[0]
     block = _block(index, queries, span)
-    longest = index.longest * (span // 2) ** 2
+    longest = index.longest * span**2 // 4
     length = jnp.where(active, jnp.minimum(block.total, longest), 0)
     squares, places = _nearest_in_list(index, queries, block, length, longest, k)
     there = (squares <= reach) & (squares < jnp.inf)
@@ -229,16 +230,6 @@ def _nearest_in_list(index, queries, block, length, longest, k):
     return jnp.stack(squares), jnp.stack(places)
 
 
-def _chain(runs):
-    """The runs as one list: where each ends, and from list index to position."""
-    ends, shifts, total = [], [], 0
-    for start, stop in runs:
-        shifts.append(start - total)
-        total = total + stop - start
-        ends.append(total)
-    return ends, shifts, total
-
-
 def _room(index, queries, first, final):
     """The squared distance to the nearest cell that was not looked at."""
     low, high, width = index.low, index.high, index.width
@@ -255,7 +246,7 @@ def _room(index, queries, first, final):
 
 
 def _search_wider(index, queries, wanted, near, k, reach) -> _Near:
-    """`near`, with the wanted rows searched in 4 x 4 x 4 cells."""
+    """`near`, with the wanted rows searched in more cells."""
     q = queries.shape[0]
     size = min(_FEW, q)
     rows, count = _listed(wanted)
@@ -264,7 +255,7 @@ def _search_wider(index, queries, wanted, near, k, reach) -> _Near:
     def tile(i, near):
         row = jax.lax.dynamic_slice(rows, (i * size,), (size,))
         points = queries.at[row].get(mode="fill", fill_value=0)
-        found = _search_cells(index, points, row < q, k, reach, 4)
+        found = _search_cells(index, points, row < q, k, reach, index.span + 2)
         put = lambda to, x: to.at[row].set(x, mode="drop")
         return jax.tree.map(put, near, found)
 
@@ -275,7 +266,8 @@ def _listed(wanted):
     """The rows that are wanted, the rest q, and how many they are."""
     q = wanted.shape[0]
     place = jnp.where(wanted, prefix_sum(wanted.astype(jnp.int32)), q)
-    rows = jnp.full(q, q, jnp.int32).at[place].set(jnp.arange(q), mode="drop")
+    number = jnp.arange(q, dtype=jnp.int32)
+    rows = jnp.full(q, q, jnp.int32).at[place].set(number, mode="drop")
     return rows, jnp.sum(wanted, dtype=jnp.int32)
 
 
