@@ -1,9 +1,10 @@
 """Exact neighbors by a cell list, with a certificate and a fallback.
 
-Points are sorted by cell. A query looks at the 2 x 2 x 2 cells around it: four runs of
-two cells, read as one list. What it finds is certainly right where the k-th distance is
-at most the distance to the boundary of these cells; the other queries (few, if the cell
-size suits the density) are searched again in a tree.
+Points are sorted by cell. A query looks at the cells around it (2 x 2 x 2 for single
+neighbors, 3 x 3 x 3 smaller ones for many): runs of cells along z, read as one list.
+What it finds is certainly right where the k-th distance is at most the distance to the
+boundary of these cells. The other queries (few, if the cell size suits the density)
+look at a cube two cells wider, and what is left is searched in a tree.
 """
 
 import equinox as eqx
@@ -17,7 +18,12 @@ from ._morton import LEVELS, bounds, curve, morton_order, occupied_cells
 from ._tree import Tree, grow, insert, search_tree
 
 _LEAF = 8
-_LANES = 1024
+_LANES = 256
+# Queries of a tile of the second look.
+_FEW = 256
+# From so many neighbors on it pays to sort queries by the length of their lists.
+_MANY = 4
+_SMALLEST_TILE = 1024
 # Lists of k candidates per query of a tile should stay in the cache.
 _TILE_ENTRIES = 4096
 _SMALLEST_TABLE, _LARGEST_TABLE = 2**12, 2**24
@@ -38,21 +44,29 @@ class CellIndex(AbstractIndex):
     coordinates: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
     tree: Tree
     longest: int = eqx.field(static=True)
+    span: int = eqx.field(static=True)
 
     # Outside jit, control flow compiles what it closes over as constants, anew at
     # every call, and XLA spends most of a minute folding them.
     @eqx.filter_jit
     def search(self, queries, active, k, reach):
-        size = max(256, _TILE_ENTRIES // k)
-        found, squares, certain = in_tiles(
-            lambda rows: _search_cells(self, *rows, k, reach), (queries, active), size
-        )
-        wanted = active & ~certain
-        return jax.lax.cond(
-            jnp.any(wanted),
-            lambda: _search_again(self, queries, wanted, found, squares, k, reach),
-            lambda: found,
-        )
+        near = _search_near(self, queries, active, k, reach)
+        for again in (_search_wider, _search_tree):
+            wanted = active & ~near.certain
+            near = jax.lax.cond(
+                jnp.any(wanted),
+                lambda: again(self, queries, wanted, near, k, reach),  # noqa: B023
+                lambda: near,  # noqa: B023
+            )
+        return near.items
+
+
+class _Near(eqx.Module):
+    """The k nearest so far, how far to search yet (squared), and if that is certain."""
+
+    items: Int[Array, "q k"]
+    limits: Float[Array, " q"]
+    certain: Bool[Array, " q"]
 
 
 class CellList(AbstractBackend):
@@ -70,7 +84,8 @@ class CellList(AbstractBackend):
         low, high = bounds(points, mask)
         order, coarse, fine = morton_order(points, mask, low, high)
         tree = grow(order, mask, points, points, _LEAF)
-        per_cell = max(4, 4 * self.neighbors // 3)
+        many = self.neighbors >= _MANY
+        per_cell = max(4, 3 * self.neighbors // 5) if many else 4
         width = _density_width(coarse, fine, mask[order], high - low, per_cell)
         table = _table_size(points.shape[0])
         width = _fitting_width(width, high - low, table)
@@ -85,6 +100,7 @@ class CellList(AbstractBackend):
         return CellIndex(
             *(given, real, low, high, width, counts, starts, order, soa, tree),
             longest=16 * per_cell,
+            span=3 if many else 2,
         )
 
 
@@ -126,66 +142,92 @@ def _cell_id(cell, counts):
     return (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]
 
 
-def _search_cells(index, queries, active, k, reach):
-    """The k nearest in the 2 x 2 x 2 cells around, how far the search has to reach if
-    that is not certain, and whether it is."""
-    n, starts = index.points.shape[0], index.starts
+def _search_near(index, queries, active, k, reach) -> _Near:
+    """Every query in the cells around it, lists of similar length together."""
+    look = lambda rows: _search_cells(index, *rows, k, reach, index.span)
+    size = max(_SMALLEST_TILE, _TILE_ENTRIES // k)
+    if k < _MANY or queries.shape[0] <= size:
+        return in_tiles(look, (queries, active), size)
+    length = jnp.where(active, _block(index, queries, index.span).total, 0)
+    number = jnp.arange(queries.shape[0], dtype=jnp.int32)
+    _, order = jax.lax.sort((length, number), num_keys=1)
+    near = in_tiles(look, (queries[order], active[order]), size)
+    return jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x), near)
+
+
+class _Block(eqx.Module):
+    """The cells around each query: `first` and `final` of them, the runs they fill as
+    one list (where each run ends, from list index to position), and its length."""
+
+    first: Int[Array, "t 3"]
+    final: Int[Array, "t 3"]
+    ends: Int[Array, "r t"]
+    shifts: Int[Array, "r t"]
+    total: Int[Array, " t"]
+
+    def position(self, j):
+        """The place in cell order of number j of the list."""
+        run = sum((j >= end).astype(jnp.int32) for end in self.ends[:-1])
+        return j + self.shifts[run, jnp.arange(self.total.shape[0])]
+
+
+def _block(index, queries, span) -> _Block:
+    """The cube of `span`^3 cells around each query."""
+    starts = index.starts
     last = (index.counts - 1).astype(queries.dtype)
     scaled = (queries - index.low) / index.width
     safe = jnp.where(jnp.isfinite(scaled), scaled, 0)
-    first = jnp.clip(jnp.floor(safe - 0.5), 0, jnp.maximum(last - 1, 0)).astype(
-        jnp.int32
-    )
-    final = jnp.minimum(first + 1, index.counts - 1)
-    runs = []
-    for x in (first[:, 0], final[:, 0]):
-        for y in (first[:, 1], final[:, 1]):
-            row = _cell_id((x, y, 0), index.counts)
-            runs.append((starts[row + first[:, 2]], starts[row + final[:, 2] + 1]))
-    runs = _without_repeats(runs, index.counts)
-    ends, shifts, total = _chain(runs)
-    length = jnp.where(active, jnp.minimum(total, index.longest), 0)
+    corner = jnp.floor(safe - (span - 1) / 2)
+    first = jnp.clip(corner, 0, jnp.maximum(last - (span - 1), 0)).astype(jnp.int32)
+    final = jnp.minimum(first + (span - 1), index.counts - 1)
+    # The runs along z of the columns of cells, one row each.
+    x, y = jnp.divmod(jnp.arange(span**2, dtype=jnp.int32)[:, None], span)
+    cell = first[:, 0] + x, first[:, 1] + y
+    there = (cell[0] <= final[:, 0]) & (cell[1] <= final[:, 1])
+    row = jnp.where(there, _cell_id((*cell, 0), index.counts), 0)
+    begin = starts[row + first[:, 2]]
+    length = jnp.where(there, starts[row + final[:, 2] + 1] - begin, 0)
+    ends = jnp.cumsum(length, axis=0, dtype=jnp.int32)
+    return _Block(first, final, ends, begin + length - ends, ends[-1])
+
+
+def _search_cells(index, queries, active, k, reach, span) -> _Near:
+    """The k nearest in the cube of `span`^3 cells around each query."""
+    n = index.points.shape[0]
+    block = _block(index, queries, span)
+    longest = index.longest * span**2 // 4
+    length = jnp.where(active, jnp.minimum(block.total, longest), 0)
+    squares, places = _nearest_in_list(index, queries, block, length, longest, k)
+    there = (squares <= reach) & (squares < jnp.inf)
+    positions = jnp.where(there, block.position(places), n)
+    found = index.order.at[positions].get(mode="fill", fill_value=n)
+    room = _room(index, queries, block.first, block.final)
+    least = jnp.minimum(squares[-1], reach)
+    return _Near(found.T, least, (block.total <= longest) & (least <= room))
+
+
+def _nearest_in_list(index, queries, block, length, longest, k):
+    """The k smallest squared distances [k, t] of each list, and their list indices.
+
+    Distances are written down before they are compared: XLA would compute a gather
+    again for each of the k places it is compared with.
+    """
     steps = jnp.max(length)
 
-    def step(j, best):
-        position = j + shifts[0]
-        for end, shift in zip(ends[:-1], shifts[1:], strict=True):
-            position = jnp.where(j >= end, j + shift, position)
-        position = jnp.where(j < length, position, n)
+    def measure(j, table):
+        position = block.position(j)
         square = sum(
             (queries[:, d] - index.coordinates[d].at[position].get(mode="clip")) ** 2
             for d in range(3)
         )
-        return insert(best, jnp.where(j < length, square, jnp.inf), position)
+        return table.at[j].set(jnp.where(j < length, square, jnp.inf))
 
-    empty = jnp.full((k, queries.shape[0]), jnp.inf, queries.dtype)
-    best = (empty, jnp.full(empty.shape, n, jnp.int32))
-    squares, positions = jax.lax.fori_loop(0, steps, step, best)
-    positions = jnp.where(squares <= reach, positions, n)
-    found = index.order.at[positions].get(mode="fill", fill_value=n)
-    room = _room(index, queries, first, final)
-    least = jnp.minimum(squares[-1], reach)
-    return found.T, least, (total <= index.longest) & (least <= room)
-
-
-def _without_repeats(runs, counts):
-    """With a single layer of cells along x or y, two runs are the same: drop one."""
-    one_x, one_y = counts[0] == 1, counts[1] == 1
-    repeated = (jnp.asarray(False), one_y, one_x, one_x | one_y)
-    return [
-        (start, jnp.where(again, start, stop))
-        for (start, stop), again in zip(runs, repeated, strict=True)
-    ]
-
-
-def _chain(runs):
-    """The runs as one list: where each ends, and from list index to position."""
-    ends, shifts, total = [], [], 0
-    for start, stop in runs:
-        shifts.append(start - total)
-        total = total + stop - start
-        ends.append(total)
-    return ends, shifts, total
+    blank = jnp.full((longest, queries.shape[0]), jnp.inf, queries.dtype)
+    table = jax.lax.fori_loop(0, steps, measure, blank)
+    empty = [jnp.full_like(length, jnp.inf, queries.dtype)] * k, [length * 0] * k
+    take = lambda j, best: insert(*best, table[j], j)
+    squares, places = jax.lax.fori_loop(0, steps, take, empty)
+    return jnp.stack(squares), jnp.stack(places)
 
 
 def _room(index, queries, first, final):
@@ -203,10 +245,36 @@ def _room(index, queries, first, final):
     return jnp.maximum(room, 0) ** 2
 
 
-def _search_again(index, queries, wanted, found, limits, k, reach):
-    """`found`, with the wanted rows searched again, up to the squares `limits`."""
+def _search_wider(index, queries, wanted, near, k, reach) -> _Near:
+    """`near`, with the wanted rows searched in more cells."""
+    q = queries.shape[0]
+    size = min(_FEW, q)
+    rows, count = _listed(wanted)
+    rows = jnp.pad(rows, (0, -q % size), constant_values=q)
+
+    def tile(i, near):
+        row = jax.lax.dynamic_slice(rows, (i * size,), (size,))
+        points = queries.at[row].get(mode="fill", fill_value=0)
+        found = _search_cells(index, points, row < q, k, reach, index.span + 2)
+        put = lambda to, x: to.at[row].set(x, mode="drop")
+        return jax.tree.map(put, near, found)
+
+    return jax.lax.fori_loop(0, -(-count // size), tile, near)
+
+
+def _listed(wanted):
+    """The rows that are wanted, the rest q, and how many they are."""
+    q = wanted.shape[0]
+    place = jnp.where(wanted, prefix_sum(wanted.astype(jnp.int32)), q)
+    number = jnp.arange(q, dtype=jnp.int32)
+    rows = jnp.full(q, q, jnp.int32).at[place].set(number, mode="drop")
+    return rows, jnp.sum(wanted, dtype=jnp.int32)
+
+
+def _search_tree(index, queries, wanted, near, k, reach) -> _Near:
+    """`near`, with the wanted rows searched in the tree."""
     # The same distance may be rounded differently here and in the cells.
-    limits = limits * (1 + 8 * jnp.finfo(limits.dtype).eps)
+    limits = near.limits * (1 + 8 * jnp.finfo(near.limits.dtype).eps)
     tree = index.tree
     clean, _ = usable(index.points, index.mask)
     soa = clean.T.at[:, tree.order].get(mode="fill", fill_value=jnp.inf)
@@ -214,8 +282,12 @@ def _search_again(index, queries, wanted, found, limits, k, reach):
     def squares(slots, points):
         return sum((points[d] - soa[d][slots]) ** 2 for d in range(3))
 
-    queue = (curve(queries, wanted), jnp.sum(wanted))
-    near = search_tree(tree, queries, limits, queue, squares, k=k, lanes=_LANES)
+    rows, count = _listed(wanted)
+    # Along a curve lanes stay together, but a few queries are not worth a sort.
+    rows = jax.lax.cond(count > _LANES, lambda: curve(queries, wanted), lambda: rows)
+    queue = (rows, count)
+    found = search_tree(tree, queries, limits, queue, squares, k=k, lanes=_LANES)
     n = index.points.shape[0]
-    items = jnp.where(near.squares <= reach, jnp.minimum(near.items, n), n).T
-    return jnp.where(wanted[:, None], items, found)
+    items = jnp.where(found.squares <= reach, jnp.minimum(found.items, n), n).T
+    items = jnp.where(wanted[:, None], items, near.items)
+    return _Near(items, near.limits, near.certain | wanted)

@@ -176,16 +176,16 @@ def _visit(tree: Tree, lane: _Lanes, squares: Callable) -> _Lanes:
     slots = slot + jnp.arange(tree.leaf, dtype=jnp.int32)[:, None]
     found = squares(slots, lane.point)
     found = jnp.where(there & jnp.isfinite(found), found, jnp.inf)
-    best = (lane.best.squares, lane.best.items)
-    for j in range(tree.leaf):
-        best = insert(best, found[j], slots[j])
+    take = lambda j, best: insert(*best, found[j], slots[j])
+    best = (list(lane.best.squares), list(lane.best.items))
+    best = jax.lax.fori_loop(0, tree.leaf, take, best)
     node, trail = _next(lane.node, lane.trail)
     return _Lanes(
         lane.row,
         jnp.where(there, node, lane.node),
         jnp.where(there, trail, lane.trail),
         lane.point,
-        Nearest(*best),
+        Nearest(*map(jnp.stack, best)),
     )
 
 
@@ -208,11 +208,16 @@ def _box_squares(tree: Tree, node, point) -> Float[Array, " t"]:
     return sum(gap(d) ** 2 for d in range(3))
 
 
-def insert(best, square, item):
-    """One more candidate into the ascending lists best = (squares, items) [k, t]."""
-    squares, items = best
-    ahead = jnp.concatenate([jnp.full_like(squares[:1], -jnp.inf), squares[:-1]])
-    ahead_items = jnp.concatenate([items[:1], items[:-1]])
-    moved = jnp.where(square < ahead, ahead_items, item)
-    items = jnp.where(square < squares, moved, items)
-    return jnp.minimum(squares, jnp.maximum(ahead, square)), items
+def insert(squares, items, square, item):
+    """One more candidate [t] into ascending lists, given row by row: k arrays [t].
+
+    As rows, not as one array [k, t], whose shifted copies XLA does not vectorize.
+    """
+    rows = list(zip(squares, items, strict=True))
+    ahead = [(jnp.full_like(square, -jnp.inf), items[0]), *rows[:-1]]
+    old = [(*row, above) for row, above in zip(rows, ahead, strict=True)]
+    squares = [jnp.minimum(s, jnp.maximum(above, square)) for s, _, (above, _) in old]
+    place = lambda s, i, above: jnp.where(
+        square < s, jnp.where(square < above[0], above[1], item), i
+    )
+    return squares, [place(*row) for row in old]

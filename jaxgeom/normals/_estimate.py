@@ -3,11 +3,12 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._core import safe_divide, safe_norm, safe_normalize
 from ..neighbors import CellList, Neighbors, build, knn
 from ..shapes import PointCloud
+from ._frames import frames
 
 
 def estimate(cloud: PointCloud, *, k: int = 16) -> PointCloud:
@@ -74,14 +75,14 @@ def smallest_direction(matrix: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3"]:
     dn = sum_i v_i (v_i . dM n) / (l_0 - l_i), and zero for equal eigenvalues, where
     the derivative of `eigh` is NaN.
     """
-    return _frame(matrix)[0][..., 0] * _is_plane(matrix)[..., None]
+    return _smallest(*frames(matrix))
 
 
 @smallest_direction.defjvp
 def _smallest_direction_jvp(primals, tangents):
     (matrix,), (change,) = primals, tangents
-    vectors, values = _frame(matrix)
-    normal = smallest_direction(matrix)
+    values, vectors = frames(matrix)
+    normal = _smallest(values, vectors)
     turned = jnp.einsum("...ij,...j->...i", change, normal)
     gaps = values[..., :1] - values[..., 1:]
     rounding = 8 * jnp.finfo(values.dtype).eps * values[..., 2:]
@@ -91,15 +92,10 @@ def _smallest_direction_jvp(primals, tangents):
     return normal, jnp.einsum("...ji,...i->...j", others, amounts)
 
 
-def _frame(matrix):
-    values, vectors = jnp.linalg.eigh(matrix)
-    return vectors, values
-
-
-def _is_plane(matrix) -> Bool[Array, "*n"]:
-    """Whether the two largest eigenvalues are positive, beyond rounding."""
-    values = jnp.linalg.eigvalsh(matrix)
-    return values[..., 1] > 32 * jnp.finfo(values.dtype).eps * values[..., 2]
+def _smallest(values, vectors):
+    """The first vector, if the two largest eigenvalues are positive beyond rounding."""
+    plane = values[..., 1] > 32 * jnp.finfo(values.dtype).eps * values[..., 2]
+    return vectors[..., 0] * plane[..., None]
 
 
 def unit(normals: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

@@ -1,0 +1,339 @@
+"""How fast scans are aligned beside small_gicp and Open3D (CPU), all steps included.
+
+    JAXGEOM_DATA=... python experiments/registration/speed.py [--cases 10k 40k many ...]
+
+A pair is bunny 045 on 000, started 10 degrees and 5 mm off, gate 5 mm: the raw scans
+(40k points each) or 10k points drawn from them. A batch is 64 ragged draws of about
+2 000 points of the raw scans, each turned by 10 degrees and moved by 5 mm from another
+draw of its own scan, aligned with it in one call. Every time holds search structures,
+normals of both sides and all iterations. Ours and the peers take turns; prints medians
+in ms of wall time and of CPU time of the process, errors in degrees and mm, the time to
+compile, and ratios. The gradient is that of a sum of the pose's numbers with respect to
+the points of both sides. Peers that are not installed are left out.
+"""
+
+import argparse
+import os
+import pathlib
+import time
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from jaxgeom import PointCloud, Rigid, stack
+from jaxgeom.normals import estimate
+from jaxgeom.pipelines import register
+from jaxgeom.registration import icp
+
+try:
+    import small_gicp
+except ImportError:
+    small_gicp = None
+try:
+    import open3d
+except ImportError:
+    open3d = None
+
+DATA = pathlib.Path(os.environ.get("JAXGEOM_DATA", ".")) / "registration"
+GATE, NEIGHBORS, MOST_STEPS, THREADS = 5.0, 12, 50, 2
+
+
+def scans():
+    """The raw bunny scans by name, in mm."""
+    table = np.load(DATA / "stanford_bunny/bunny_scans.npz")
+    return {k[:-4]: 1e3 * table[k] for k in table if k.endswith("_xyz")}
+
+
+def pose(name):
+    """world_from_scan [4, 4] of bun.conf, in mm."""
+    for line in (DATA / "stanford_bunny/bun.conf").read_text().splitlines():
+        if line.startswith("bmesh") and line.split()[1] == f"{name}.ply":
+            values = np.array(line.split()[2:], float)
+            # The published quaternions turn the other way.
+            turn = Rotation.from_quat(values[3:]).as_matrix().T
+            return matrix(turn, 1e3 * values[:3])
+    raise KeyError(name)
+
+
+def matrix(turn, shift):
+    """[[R, t], [0, 1]]."""
+    return np.vstack([np.column_stack([turn, shift]), [0, 0, 0, 1]])
+
+
+def offset(truth, center, rng, degrees=10.0, distance=5.0):
+    """The pose `truth`, turned about the moved `center` and shifted at random."""
+    axis, way = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 3)))
+    turn = Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix()
+    middle = truth[:3, :3] @ center + truth[:3, 3]
+    return matrix(turn, middle - turn @ middle + distance * way) @ truth
+
+
+def errors(found, truth, center):
+    """Degrees, and how far the center of the source is off."""
+    angle = Rotation.from_matrix(found[:3, :3] @ truth[:3, :3].T).magnitude()
+    apart = (found - truth)[:3, :3] @ center + (found - truth)[:3, 3]
+    return np.degrees(angle), np.linalg.norm(apart)
+
+
+def pair_case(size):
+    """Source, target, start and truth."""
+    rng = np.random.default_rng(3)
+    table = scans()
+    truth = np.linalg.inv(pose("bun000")) @ pose("bun045")
+    source, target = table["bun045"], table["bun000"]
+    if size is not None:
+        draw = lambda x: x[rng.permutation(len(x))[:size]]
+        source, target = draw(source), draw(target)
+    return source, target, offset(truth, source.mean(axis=0), rng), truth
+
+
+def batch_case(count, size):
+    """Such pairs of ragged draws of one scan each, the sources moved."""
+    rng = np.random.default_rng(5)
+    table = list(scans().values())
+    out = []
+    for i in range(count):
+        scan = table[i % len(table)]
+        numbers = rng.integers(9 * size // 10, 11 * size // 10, 2)
+        source, target = (scan[rng.permutation(len(scan))[:n]] for n in numbers)
+        center = source.mean(axis=0)
+        moved = offset(np.eye(4), center, rng)
+        source = source @ moved[:3, :3].T + moved[:3, 3]
+        out.append((source, target, np.eye(4), np.linalg.inv(moved)))
+    return out
+
+
+def prepared(points):
+    """A cloud in single precision, on the device."""
+    return PointCloud(jnp.asarray(points, jnp.float32))
+
+
+# One program for both sides. Within one program XLA on the CPU may run two independent
+# loops at once, and then wait forever for threads that wait for each other.
+oriented = eqx.filter_jit(lambda cloud: estimate(cloud, k=NEIGHBORS))
+
+
+@eqx.filter_jit
+def aligned(source, target, start, gate):
+    """The alignment of clouds with normals."""
+    return icp(source, target, init=start, max_distance=gate, max_steps=MOST_STEPS)
+
+
+def align(source, target, start, gate):
+    """One alignment from bare points: normals of both sides, then `icp`."""
+    return aligned(oriented(source), oriented(target), start, gate)
+
+
+@eqx.filter_jit
+def align_all(clouds, starts, gate):
+    """All alignments of a batch, one after the other in one program.
+
+    `clouds` holds the sources, and then the targets.
+    """
+    clouds = jax.lax.map(lambda cloud: estimate(cloud, k=NEIGHBORS), clouds)
+    half = starts.translation.shape[0]
+    sides = [jax.tree.map(lambda x, i=i: x[i : i + half], clouds) for i in (0, half)]
+    return jax.lax.map(lambda item: aligned(*item, gate), (*sides, starts))
+
+
+def rigid(table):
+    """Matrices [..., 4, 4] as a transform in single precision."""
+    table = np.asarray(table, np.float32)
+    return Rigid(jnp.asarray(table[..., :3, :3]), jnp.asarray(table[..., :3, 3]))
+
+
+def table_of(transform):
+    """A transform as a matrix."""
+    turn, shift = np.asarray(transform.rotation), np.asarray(transform.translation)
+    return matrix(turn.astype(float), shift.astype(float))
+
+
+def by_gicp(kind, threads):
+    """A function that aligns a pair by small_gicp."""
+
+    def run(source, target, start, _):
+        there, here = (small_gicp.PointCloud(x) for x in (target, source))
+        trees = [small_gicp.KdTree(x, num_threads=threads) for x in (there, here)]
+        for cloud, tree in zip((there, here), trees, strict=True):
+            small_gicp.estimate_normals_covariances(
+                cloud, tree, num_neighbors=NEIGHBORS, num_threads=threads
+            )
+        found = small_gicp.align(
+            *(there, here, trees[0], start),
+            registration_type=kind,
+            max_correspondence_distance=GATE,
+            num_threads=threads,
+            max_iterations=MOST_STEPS,
+        )
+        return found.T_target_source
+
+    return run
+
+
+def by_open3d(source, target, start, _):
+    """The pose by Open3D, point to plane."""
+    clouds = []
+    for points in (source, target):
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+        near = open3d.geometry.KDTreeSearchParamKNN(NEIGHBORS)
+        cloud.estimate_normals(near)
+        clouds.append(cloud)
+    rules = open3d.pipelines.registration
+    found = rules.registration_icp(
+        *(*clouds, GATE, start),
+        rules.TransformationEstimationPointToPlane(),
+        rules.ICPConvergenceCriteria(max_iteration=MOST_STEPS),
+    )
+    return found.transformation
+
+
+def peers():
+    """The peers that are installed, by name."""
+    out = {}
+    if small_gicp is not None:
+        out["gicp plane, 2 threads"] = by_gicp("PLANE_ICP", THREADS)
+        out["gicp gicp, 2 threads"] = by_gicp("GICP", THREADS)
+    if open3d is not None:
+        out["open3d plane"] = by_open3d
+    return out
+
+
+def clock(runs, repeats):
+    """Name -> median wall and CPU seconds, the runs taking turns."""
+    times = {name: [] for name in runs}
+    for _ in range(repeats):
+        for name, run in runs.items():
+            wall, work = time.perf_counter(), time.process_time()
+            run()
+            stop = time.perf_counter(), time.process_time()
+            times[name].append((stop[0] - wall, stop[1] - work))
+    return {name: np.median(t, axis=0) for name, t in times.items()}
+
+
+def first(name, run):
+    """The first call, which compiles: its result, and how long it took."""
+    start = time.perf_counter()
+    result = jax.block_until_ready(run())
+    print(f"  {name}: first call {time.perf_counter() - start:.1f} s", flush=True)
+    return result
+
+
+def show(times, notes):
+    """One row a method, with the ratio of the first to it."""
+    ours = next(iter(times.values()))
+    for name, (wall, work) in times.items():
+        print(
+            f"  {name:24}{1e3 * wall:9.1f} ms wall{1e3 * work:9.1f} cpu   ratio "
+            f"{ours[0] / wall:5.2f} wall {ours[1] / work:5.2f} cpu   {notes[name]}",
+            flush=True,
+        )
+
+
+def note(found, truth, center):
+    """The errors in words."""
+    return "{:.4f} deg {:.4f} mm".format(*errors(found, truth, center))
+
+
+def one_pair(label, size, repeats, door):
+    """The table of one pair."""
+    source, target, start, truth = pair_case(size)
+    print(f"{label}: {len(source)} on {len(target)}")
+    arguments = (prepared(source), prepared(target), rigid(start), jnp.float32(GATE))
+    runs = {"icp": lambda: jax.block_until_ready(align(*arguments))}
+    found = first("icp", runs["icp"])
+    center = source.mean(axis=0)
+    told = lambda f: (
+        note(table_of(f.target_from_source), truth, center)
+        + f", {int(f.num_steps)} steps, status {int(f.result._value)}"
+    )
+    notes = {"icp": told(found)}
+    if door:
+        init = Rigid(start[:3, :3], start[:3, 3])
+        runs["register"] = lambda: register(source, target, init=init, throw=False)
+        notes["register"] = told(first("register", runs["register"]))
+    for name, peer in peers().items():
+        runs[name] = lambda peer=peer: peer(source, target, start, None)
+        notes[name] = note(runs[name](), truth, center)
+    show(clock(runs, repeats), notes)
+
+
+def gradient(label, size, repeats):
+    """An alignment with its derivative beside the alignment alone."""
+    source, target, start, _ = pair_case(size)
+    here, there = (oriented(prepared(x)) for x in (source, target))
+    arguments = (here, there, rigid(start), jnp.float32(GATE))
+
+    def value(points, here, there, start, gate):
+        swap = lambda c, p: eqx.tree_at(lambda c: c.points, c, p)
+        clouds = [swap(c, p) for c, p in zip((here, there), points, strict=True)]
+        moved = icp(*clouds, init=start, max_distance=gate).target_from_source
+        return jnp.sum(moved.rotation) + jnp.sum(moved.translation)
+
+    alone, both = eqx.filter_jit(value), eqx.filter_jit(jax.value_and_grad(value))
+    given = ((here.points, there.points), *arguments)
+    runs = {
+        "gradient": lambda: jax.block_until_ready(both(*given)),
+        "alignment": lambda: jax.block_until_ready(alone(*given)),
+    }
+    print(f"{label}: value and gradient beside the value (normals given)")
+    for name, run in runs.items():
+        first(name, run)
+    show(clock(runs, repeats), dict.fromkeys(runs, ""))
+
+
+def many(count, size, repeats):
+    """The table of a batch."""
+    batch = batch_case(count, size)
+    print(f"{count} pairs of about {size} points")
+    clouds = stack([PointCloud(item[i]) for i in (0, 1) for item in batch])
+    number = lambda x: jnp.asarray(x, jnp.float32 if x.dtype == float else x.dtype)
+    clouds = jax.tree.map(number, clouds)
+    starts = rigid(np.stack([item[2] for item in batch]))
+    arguments = (clouds, starts, jnp.float32(GATE))
+    runs = {"icp": lambda: jax.block_until_ready(align_all(*arguments))}
+    found = first("icp", runs["icp"])
+    pick = lambda i: jax.tree.map(lambda x: x[i], found.target_from_source)
+    told = lambda tables: "median {:.4f} deg {:.4f} mm, worst {:.3f} {:.3f}".format(
+        *_spread(
+            [
+                errors(t, item[3], item[0].mean(axis=0))
+                for t, item in zip(tables, batch, strict=True)
+            ]
+        )
+    )
+    steps = np.asarray(found.num_steps)
+    notes = {"icp": told([table_of(pick(i)) for i in range(count)])}
+    notes["icp"] += f", mean steps {steps.mean():.1f}"
+    for name, peer in peers().items():
+        runs[name] = lambda peer=peer: [peer(*item) for item in batch]
+        notes[name] = told(runs[name]())
+    show(clock(runs, repeats), notes)
+
+
+def _spread(rows):
+    rows = np.asarray(rows)
+    return (*np.median(rows, axis=0), *rows.max(axis=0))
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    cases = ["10k", "40k", "many", "gradient"]
+    parser.add_argument("--cases", nargs="+", default=cases, choices=cases)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--door", action="store_true", help="the door `register` too")
+    args = parser.parse_args()
+    for case in args.cases:
+        if case in ("10k", "40k"):
+            size = 10_000 if case == "10k" else None
+            one_pair(case, size, args.repeats, args.door)
+        if case == "many":
+            many(64, 2000, args.repeats)
+        if case == "gradient":
+            gradient("10k", 10_000, args.repeats)
+
+
+if __name__ == "__main__":
+    main()
