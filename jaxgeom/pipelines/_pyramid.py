@@ -68,7 +68,7 @@ def align(
     pair = jax.tree.map(lambda a, b: jnp.stack([a, b]), source, target)
     steps, overflow = jnp.zeros((), jnp.int32), jnp.asarray(False)
     for i, room in enumerate(rooms):
-        side = pyramid.voxels[i] * voxel_size
+        side = _after(pyramid.voxels[i] * voxel_size, steps)
         # Both clouds in one loop: the program of a level is compiled once.
         level = partial(make_level, side=side, room=room, neighbors=pyramid.neighbors)
         small, need = jax.lax.map(level, pair)
@@ -87,6 +87,15 @@ def align(
     )
     where = lambda r: (r.num_steps, r.result)
     return eqx.tree_at(where, found, (steps, result))
+
+
+def _after(value, steps):
+    """`value`, but only once `steps` (never negative) is known.
+
+    Otherwise a CPU may prepare a level while the one before still runs, which gains
+    nothing on few cores, and such programs were seen to stall.
+    """
+    return jnp.where(steps < 0, jnp.nan, value)
 
 
 def occupied(points: Float[Array, "n 3"], side: float) -> int:
