@@ -55,8 +55,11 @@ class CellIndex(AbstractIndex):
             wanted = active & ~near.certain
             near = jax.lax.cond(
                 jnp.any(wanted),
-                lambda: again(self, queries, wanted, near, k, reach),  # noqa: B023
-                lambda: near,  # noqa: B023
+                lambda near, wanted, again=again: again(
+                    self, queries, wanted, near, k, reach
+                ),
+                lambda near, wanted: near,
+                *(near, wanted),
             )
         return near.items
 

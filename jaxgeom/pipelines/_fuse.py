@@ -12,6 +12,7 @@ from ..registration import MultiView, match_views, multiview, spanning_poses
 from ..shapes import PointCloud
 from ..transforms import Rigid
 from ._frames import Frames, checked, oriented
+from ._pyramid import occupied
 from ._reconstruct import Reconstruction, reconstruct
 
 # The side of a voxel as a share of the longest side of a scan, and of the features'.
@@ -112,15 +113,8 @@ def _refine(batch, start, fine, capacity):
 
 def _num_voxels(batch, fine) -> int:
     """The most voxels of the finest level that one scan occupies, as a bucket."""
-    counts = [
-        len(np.unique(np.floor((x - x.min(axis=0)) / fine).astype(np.int64), axis=0))
-        for x in (p[m] for p, m in zip(*_on_host(batch), strict=True))
-    ]
-    return bucket(max(counts))
-
-
-def _on_host(batch):
-    return np.asarray(batch.points), np.asarray(batch.mask)
+    rows = zip(np.asarray(batch.points), np.asarray(batch.mask), strict=True)
+    return bucket(max(occupied(points[mask], fine) for points, mask in rows))
 
 
 def _union(scans, batch, poses) -> PointCloud:
