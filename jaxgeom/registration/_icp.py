@@ -108,10 +108,10 @@ class _Scene(eqx.Module):
         shift = pose.shift() - self.center + pose.linear() @ self.source_center
         return eqx.tree_at(lambda t: t.translation, pose, shift)
 
-    def match(self, pose) -> Found:
-        """The pairs at a pose."""
-        rule = self.method.correspondence
-        return rule.match(self.prepared, pose(self.source), self.max_distance)
+    def match(self, pose, last: Found | None = None) -> Found:
+        """The pairs at a pose, given those at the pose before."""
+        rule, moved = self.method.correspondence, pose(self.source)
+        return rule.match(self.prepared, moved, self.max_distance, last)
 
     def problem(self, pose, found, previous) -> Problem:
         """The problem of given pairs at a pose, with the next width."""
@@ -248,7 +248,7 @@ def _iterate(scene, pose, rtol, max_steps, history) -> _State:
         pose = move @ state.pose
         return _State(
             pose,
-            scene.match(pose),
+            scene.match(pose, state.found),
             jnp.where(some, step.damping, state.damping),
             problem.width,
             state.steps + 1,
