@@ -148,6 +148,7 @@ class AbstractNearest(AbstractCorrespondence):
 
     def prepare(self, target):
         _check_target(target, PointCloud, "this correspondence")
+        target = jax.tree.map(jnp.asarray, target)
         index = build(target.points, target.mask, backend=self.backend)
         return _Indexed(target, index)
 
