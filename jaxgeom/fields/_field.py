@@ -76,6 +76,18 @@ class AbstractField(eqx.Module):
         """The wall of `thickness` around the surface."""
         return _room().Shell(self, thickness)
 
+    def rounded(self, radius) -> "AbstractField":
+        """The body grown by radius >= 0, its edges rounded; stays exact outside."""
+        return _room().Rounded(self, radius)
+
+    def extrude(self, half_height) -> "AbstractField":
+        """A shape of the plane, thickened to |z| <= half_height."""
+        return _room().Extruded(self, half_height)
+
+    def revolve(self, offset=0.0) -> "AbstractField":
+        """A shape of the plane, moved outwards by `offset` and turned about z."""
+        return _room().Revolved(self, offset)
+
     def translate(self, shift) -> "AbstractField":
         """The body moved by the vector [3]."""
         shift = vector("shift", self.dimension)(shift)
