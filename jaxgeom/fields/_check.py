@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._core import safe_norm
 from ._claims import Bounds, Claims, Trust
+from ._field import claims
 
 _RESOLUTION = 64
 
@@ -39,7 +40,8 @@ class Report(eqx.Module):
     """What `check_field` found; `print` it to read it.
 
     - `kept`: whether all promises are kept.
-    - `lines`: one sentence for each promise, that of a broken one begins with BROKEN.
+    - `lines`: one sentence for each promise; that of a broken one begins with BROKEN.
+    - `contract`: the numbers behind them, in double precision.
     """
 
     kept: bool
@@ -48,6 +50,100 @@ class Report(eqx.Module):
 
     def __str__(self):
         return "\n".join(self.lines)
+
+
+def check_field(
+    field: Callable,
+    *,
+    low=None,
+    high=None,
+    count: int = 1000,
+    seed: int = 0,
+    tolerance: float = 1e-6,
+) -> Report:
+    """Whether a field keeps the contract of fields: run it on your own (host).
+
+    Checked at `count` random points, and at special ones (corners, centers, axes):
+    values and gradients are finite, also those in the parameters; slopes stay below the
+    Lipschitz constant; where an exact distance is promised, one step along the gradient
+    lands on the surface with slope 1; the body lies in its box; float32 agrees with
+    float64; jit with the plain call; vmap with a loop. Sampling finds most broken
+    promises, it does not prove that one is kept.
+
+    **Arguments:**
+
+    - `field`: any callable point [3] -> number. What it promises is in its `claims`; of
+      a plain function nothing is known, see `declare`.
+    - `low`, `high`: [3] each, where to look; the field's box by default (2 around the
+      origin where that has no end).
+    - `tolerance`: errors up to this times the size of the box are rounding.
+    """
+    with jax.enable_x64(True):
+        wide = _cast(field, np.float64)
+        seen = claims(wide)
+        where = seen.bounds if low is None else Bounds.of(_corner(low), _corner(high))
+        points, special = map(jnp.asarray, probes(where, count, seed))
+        found = jax.device_get(eqx.filter_jit(contract)(wide, points, special, seen))
+        seen = jax.device_get(seen)
+        scale = 1 + float(np.abs(points).max())
+        few = points[:8]
+        values = np.asarray(jax.vmap(lambda x: wide(x))(few))
+        jitted = np.asarray(eqx.filter_jit(lambda f, x: f(x))(wide, few[0]))
+        alone = np.stack([np.asarray(wide(x)) for x in few])
+    narrow = jax.vmap(lambda x: field(x))(jnp.asarray(np.float32(few)))
+    single = float(np.abs(values - np.asarray(narrow)).max())
+    limits = tolerance * scale, float(jnp.finfo(jnp.float32).eps) * 1000 * scale
+    agreement = (
+        np.abs(jitted - alone[0]).max(),
+        np.abs(values - alone).max(),
+        single,
+    )
+    lines = [*_contract_lines(found, seen, limits[0]), *_agreement(agreement, limits)]
+    texts = tuple(("kept: " if good else "BROKEN: ") + text for good, text in lines)
+    return Report(all(good for good, _ in lines), texts, found)
+
+
+def _contract_lines(found: Contract, seen: Claims, limit: float):
+    """(kept, sentence) for each promise that the field makes."""
+    yield bool(found.finite), "values and gradients are finite at all points"
+    steep = float(seen.lipschitz)
+    if np.isfinite(steep):
+        most = (1 + float(found.steepness)) * steep
+        text = f"the Lipschitz constant is {steep:.4g}, the largest slope {most:.4g}"
+        yield bool(found.steepness <= limit), text
+    elif np.isnan(steep):
+        yield True, "no Lipschitz constant is promised: give one to `declare`"
+    else:
+        yield True, "there is no Lipschitz constant: tracing needs `within` or a bound"
+    for side in ("outside", "inside"):
+        trust, error = getattr(seen.exactness, side), float(getattr(found, side))
+        if trust == Trust.EXACT:
+            text = f"the distance is exact {side}, the largest error {error:.2g}"
+            yield bool(error <= limit), text
+    text = f"the body lies in its box (beyond it by {float(found.box):.2g})"
+    yield bool(found.box <= limit), text
+    text = f"outside its box the field grows as promised (lacking {found.growth:.2g})"
+    yield bool(found.growth <= limit), text
+
+
+def _agreement(errors, limits):
+    double, single = limits
+    names = (
+        "jit and plain call agree",
+        "vmap and loop agree",
+        "float32 and float64 agree",
+    )
+    for name, error, limit in zip(names, errors, (double, double, single), strict=True):
+        yield bool(error <= limit), f"{name} (difference {float(error):.2g})"
+
+
+def _cast(field, dtype):
+    cast = lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array(x) else x
+    return jax.tree.map(cast, field)
+
+
+def _corner(x):
+    return jnp.asarray(np.asarray(x, float))
 
 
 def contract(

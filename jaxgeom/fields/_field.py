@@ -76,6 +76,50 @@ class AbstractField(eqx.Module):
         """The wall of `thickness` around the surface."""
         return _room().Shell(self, thickness)
 
+    def elongate(self, half_extents) -> "AbstractField":
+        """The body cut at its middle planes and pulled apart by 2 half_extents [3]."""
+        return _room().Elongated(self, half_extents)
+
+    def twist(self, rate) -> "AbstractField":
+        """The body turned about z by `rate` radians per unit of height."""
+        return _room().Twisted(self, rate)
+
+    def bend(self, rate) -> "AbstractField":
+        """The body's x-axis laid on a circle of radius 1 / rate."""
+        return _room().Bent(self, rate)
+
+    def taper(self, bottom, top) -> "AbstractField":
+        """The body's sections scaled by a factor from `bottom` to `top` along z."""
+        return _room().Tapered(self, bottom, top)
+
+    def displace(self, displacement: Callable, amplitude) -> "AbstractField":
+        """The sum with another function, whose size is at most `amplitude`."""
+        return _room().Displaced(self, displacement, amplitude)
+
+    def morph(self, other: Callable, t) -> "AbstractField":
+        """(1 - t) of this and t of the other."""
+        return _room().Morphed(self, other, t)
+
+    def mirror(self, normal, offset=0.0) -> "AbstractField":
+        """The body and its image in the plane normal . x = offset |normal|."""
+        return _room().Mirrored(self, normal, offset)
+
+    def repeat(self, spacing, counts=(None, None, None)) -> "AbstractField":
+        """Copies at the multiples of `spacing` [3]; `counts` None: without end."""
+        return _room().Repeated(self, spacing, counts)
+
+    def repeat_around(self, count: int) -> "AbstractField":
+        """`count` copies turned about the z-axis."""
+        return _room().PolarRepeated(self, count)
+
+    def smooth_and(self, other: Callable, width) -> "AbstractField":
+        """The intersection with its edge rounded off over `width`."""
+        return _room().SmoothIntersection(self, other, width)
+
+    def smooth_sub(self, other: Callable, width) -> "AbstractField":
+        """The difference with its edge rounded off over `width`."""
+        return _room().SmoothDifference(self, other, width)
+
     def rounded(self, radius) -> "AbstractField":
         """The body grown by radius >= 0, its edges rounded; stays exact outside."""
         return _room().Rounded(self, radius)
@@ -151,7 +195,9 @@ def declare(
         0.0,
     )
     promise = Claims(jnp.asarray(lipschitz, float), exactness, box, space)
-    return Declared(function, promise)
+    # A plain function is no array: as a Partial it is part of the pytree's structure.
+    known = isinstance(function, eqx.Module)
+    return Declared(function if known else jax.tree_util.Partial(function), promise)
 
 
 def claims(field: Callable, *, dimension: int = 3) -> Claims:

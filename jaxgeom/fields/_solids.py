@@ -1,5 +1,4 @@
 """Convex bodies with flat faces, from corners and faces or from planes.
-planes.
 
 Outside, the nearest face is found by its border: the distance is that to its plane
 where the foot lies within the face, and else that to its nearest edge. Inside, the
