@@ -32,7 +32,8 @@ def extract(
     **Arguments:**
 
     - `field`: [x, y, z] samples at the nodes of `grid`, or a function of one point [3].
-    - `method`: the settings of an extractor.
+    - `method`: the settings of an extractor. It is given the samples and, where
+      `field` is a function, the function as `field=`.
     - `closed`: surround the grid by a layer of outside nodes, so that a surface that
       leaves the grid is closed half a cell beyond its sides.
 
@@ -41,14 +42,16 @@ def extract(
         ball = extract(lambda p: jnp.linalg.norm(p) - 0.7, grid).mesh
     """
     token = runtime_token()
-    values = _sample(field, grid) if callable(field) else jnp.asarray(field)
+    function = field if callable(field) else None
+    values = jnp.asarray(field) if function is None else _sample(field, grid)
     # A Python number would be a constant of the program: one compilation per level.
     level = jnp.asarray(level, jnp.result_type(values.dtype, float))
     if closed:
         values, grid = _pad(values, grid, level)
     needed = jax.device_get(_measure(method, values, level, token))
     sizes = (int(needed.vertices), int(needed.faces), int(needed.cells))
-    out = _run(method, values, grid, level, Capacity.holding(*sizes), token)
+    capacity = Capacity.holding(*sizes)
+    out = _run(method, values, grid, level, capacity, function, token)
     return eqx.tree_at(lambda e: e.mesh, out, out.mesh.trim())
 
 
@@ -91,5 +94,5 @@ def _measure(method, values, level, token):
 
 
 @eqx.filter_jit
-def _run(method, values, grid, level, capacity, token):
-    return method(values, grid, level, capacity=capacity, token=token)
+def _run(method, values, grid, level, capacity, field, token):
+    return method(values, grid, level, capacity=capacity, field=field, token=token)
