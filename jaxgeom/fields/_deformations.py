@@ -86,10 +86,10 @@ class Bent(AbstractField):
     """The body's x-axis laid on a circle of radius 1 / rate in the xy-plane, which
     starts at the origin along x and turns towards y; rate > 0 (1 / length).
 
-    f(q) with q = (angle / rate, 1 / rate - r, z), r and angle around (0, 1 / rate), and
-    at most r. A lower bound, over the Lipschitz constant: 1 and twice that of f over
-    1 - rate y, y the largest in the body's box (infinite where the body reaches the
-    center). The body must be shorter than the circle, |x| < pi / rate.
+    f(q) with q = (angle / rate, 1 / rate - r, z), r and angle around (0, 1 / rate),
+    capped around the center. A lower bound, over the Lipschitz constant: 1 and twice
+    that of f over 1 - rate y, y the largest in the body's box (infinite where the body
+    reaches the center). The body must be shorter than the circle, |x| < pi / rate.
     """
 
     body: Callable
@@ -110,7 +110,8 @@ class Bent(AbstractField):
         # Beyond the half turn the other end of the body may be nearer.
         near = jnp.minimum(at(angle), at(angle - turn * jnp.sign(angle))) + beyond
         # Around the center, where the angle changes without bound, this is the least.
-        return jnp.minimum(near, r)
+        least = bend - box.high[1].astype(point.dtype)
+        return jnp.minimum(near, jnp.maximum(least, 2 * r - least) / 2)
 
     def claims(self):
         part = claims(self.body)

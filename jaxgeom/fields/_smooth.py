@@ -199,5 +199,7 @@ def union_claims(bodies, depth) -> Claims:
 
 def _smooth_min(node, a, b):
     k = node.width / 6
-    weight = node.fillet.weight(safe_divide(jnp.abs(a - b), k))
-    return jnp.minimum(a, b) - k * weight
+    # Not |a - b|, whose derivative at a tie is 1: here it is 0, and smin's is 1/2 each.
+    least = jnp.minimum(a, b)
+    weight = node.fillet.weight(safe_divide(jnp.maximum(a, b) - least, k))
+    return least - k * weight
