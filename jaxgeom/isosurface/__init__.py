@@ -22,6 +22,8 @@ from ._flexicubes import flexicubes as flexicubes
 from ._marching_cubes import MarchingCubes as MarchingCubes
 from ._marching_cubes import count as count
 from ._marching_cubes import marching_cubes as marching_cubes
+from ._marching_squares import Polylines as Polylines
+from ._marching_squares import marching_squares as marching_squares
 from ._placement import AbstractPlacement as AbstractPlacement
 from ._placement import Cubic as Cubic
 from ._placement import Linear as Linear

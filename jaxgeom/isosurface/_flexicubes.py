@@ -10,8 +10,8 @@ With raw weights a, b, g, d of any size, all zero at first:
 The crossing of the edge (i, j) as its cell sees it is the root of the line through the
 scaled values, u = x_i + t (x_j - x_i), t = alpha_i s_i / (alpha_i s_i - alpha_j s_j),
 with s the values above the level. The vertex of a patch is sum beta u / sum beta, in
-the convex hull of its crossings. The weights of a cell reach only its own vertices, so that
-each vertex can be put anywhere in that hull.
+the convex hull of its crossings. The weights of a cell reach only its own vertices, so
+that each vertex can be put anywhere in that hull.
 
 L_dev, the regulariser: for each vertex v, with d_e = |v - u_e| over its crossings
 without weights, mean_e |d_e - mean d|; it keeps vertices amid their crossings.
