@@ -43,6 +43,8 @@ _SEPARATE = SeparateInside()
 _NARROW = 0.02
 # Distances along an edge, in cells, below which two diagonals fit it equally well.
 _SAME_FIT = 1e-3
+# Differences of the smaller triangle, relative to the quad, that do not count.
+_SAME_SHAPE = 1e-3
 
 
 class Dual(eqx.Module):
@@ -175,7 +177,8 @@ def _around_edge(dual, vertices, grid):
 def choose_diagonal(split: QuadSplit) -> Bool[Array, " e"]:
     """True for the diagonal from corner 1 to corner 3."""
     bad = split.narrow < _NARROW
-    shape = split.narrow[1] > split.narrow[0]
+    # Rectangles are frequent: rounding must not choose for them.
+    shape = split.narrow[1] > split.narrow[0] + _SAME_SHAPE
     fit = split.misfit[1] < split.misfit[0]
     same = jnp.abs(split.misfit[1] - split.misfit[0]) < _SAME_FIT
     return jnp.where(
