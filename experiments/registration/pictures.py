@@ -34,7 +34,7 @@ from jaxgeom.registration import (
 )
 
 AXES, DRAWN, FARTHEST = 12, 3000, 5.0
-ANGLES = (20, 40, 60, 80, 100)
+ANGLES = (20, 40, 60, 80)
 
 
 def scene():

@@ -73,6 +73,7 @@ def _parser():
     _add_register(commands)
     _add_register_many(commands)
     _add_fuse(commands)
+    _add_mesh(commands)
     _add_info(commands)
     _add_pictures(commands)
     for command in commands.choices.values():
@@ -218,6 +219,45 @@ def _add_fuse(commands):
     _add_surface(command)
 
 
+def _add_mesh(commands):
+    command = commands.add_parser(
+        "mesh", help="the surface of a field that a Python script defines"
+    )
+    command.add_argument(
+        "scene", metavar="SCENE.py:NAME", help="a field, or a callable"
+    )
+    command.add_argument("-o", "--output", required=True, metavar="MESH")
+    command.add_argument(
+        "--resolution",
+        type=_mesh_resolution,
+        default=128,
+        metavar="N",
+        help="nodes along the longest side (128)",
+    )
+    command.add_argument(
+        "--method",
+        choices=(
+            "marching-cubes",
+            "dual-contouring",
+            "dual-marching-cubes",
+            "flexicubes",
+        ),
+        default="marching-cubes",
+    )
+    command.add_argument("--level", type=_finite, default=0.0, help="of the field (0)")
+    _add_bounds(command)
+    command.add_argument("--report", metavar="JSON", help="parameters, sizes, checks")
+
+
+def _add_bounds(command):
+    command.add_argument(
+        "--bounds",
+        type=_bounds,
+        metavar="XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX",
+        help="the box to look at (default: the field's own; write --bounds=-1,...)",
+    )
+
+
 def _add_info(commands):
     command = commands.add_parser("info", help="what a file holds")
     command.add_argument("input", metavar="FILE")
@@ -225,10 +265,12 @@ def _add_info(commands):
 
 def _add_pictures(commands):
     for name, what in (("render", "a picture (PNG)"), ("view", "an HTML page")):
-        command = commands.add_parser(name, help=f"{what} of a mesh or cloud")
+        fields = ", or of a field SCENE.py:NAME" if name == "render" else ""
+        command = commands.add_parser(name, help=f"{what} of a mesh or cloud{fields}")
         command.add_argument("input", metavar="FILE")
         command.add_argument("-o", "--output", required=True)
         if name == "render":
+            _add_bounds(command)
             command.add_argument("--size", type=int, default=800, help="pixels (800)")
             command.add_argument("--azimuth", type=float, default=-60.0)
             command.add_argument("--elevation", type=float, default=20.0)
@@ -239,6 +281,21 @@ def _distance(text):
     percent = text.endswith("%")
     value = _positive(text.rstrip("%"))
     return -value / 100 if percent else value
+
+
+def _bounds(text):
+    """Six numbers, low and high of each axis."""
+    try:
+        values = [float(x) for x in text.split(",")]
+    except ValueError:
+        values = []
+    ends = zip(values[::2], values[1::2], strict=False)
+    if len(values) != 6 or not all(-1e12 < a < b < 1e12 for a, b in ends):
+        raise argparse.ArgumentTypeError(
+            f"must be six numbers xmin,xmax,... with each min below its max, given "
+            f"{text!r}"
+        )
+    return values
 
 
 def _number(kind, low, high, what):
@@ -255,6 +312,8 @@ def _number(kind, low, high, what):
 
 
 _resolution = _number(int, 8, 4096, "a whole number from 8 to 4096")
+_mesh_resolution = _number(int, 8, 1024, "a whole number from 8 to 1024")
+_finite = _number(float, -1e12, 1e12, "a number")
 _depth = _number(int, 3, 12, "a whole number from 3 to 12")
 _nonnegative = _number(float, 0.0, 1e9, "a number of at least 0")
 _positive = _number(float, 1e-12, 1e12, "a number above 0")

@@ -36,6 +36,7 @@ def test_viewpoints():
         orient_toward_viewpoint(PointCloud(points), jnp.zeros(3))
 
 
+@pytest.mark.slow
 def test_two_objects_and_a_hollow_one():
     big = trimesh.creation.icosphere(subdivisions=4, radius=1.3)
     hollow = trimesh.creation.icosphere(subdivisions=4, radius=0.7)

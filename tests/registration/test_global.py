@@ -154,6 +154,7 @@ def test_real_scans_without_a_pose(data):
 KEY = jax.random.key(3)
 
 
+@pytest.mark.slow
 def test_unlike_shapes_have_no_consensus():
     few = np.arange(6000) < 500
 

@@ -35,6 +35,7 @@ def is_red(image):
     return image[..., 0] > image[..., 2]
 
 
+@pytest.mark.slow
 def test_field_and_mesh_of_one_body_give_one_picture():
     field = render.render_field(jf.Torus(0.6, 0.25), CAMERA, size=SIZE, color=RED)
     mesh = render.render_mesh(torus_mesh(), CAMERA, size=SIZE, color=RED)
