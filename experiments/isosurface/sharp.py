@@ -1,6 +1,7 @@
 """How near the extractors come to sharp shapes, and to smooth ones (CPU).
 
     python experiments/isosurface/sharp.py --resolution 64
+    python experiments/isosurface/sharp.py --picture /tmp/sharp.png
 
 Bodies with edges, turned at random, on a grid of three different spacings. Prints in
 cells (the widest spacing): the distance of points on the edges of the body from the
@@ -35,6 +36,8 @@ METHODS = {
     "dual contouring, cuts=0": DualContouring(cuts=0),
 }
 HALF = np.array([0.5, 0.42, 0.56], np.float32)
+
+PICTURED = ("marching cubes", "dual marching cubes", "dual contouring")
 
 
 def box():
@@ -178,11 +181,46 @@ def convergence():
         print(f"| {label} | {written} | {orders[0]:.2f}, {orders[1]:.2f} |", flush=True)
 
 
+def picture(path, body, resolution):
+    """The same body by all extractors, side by side, each with a closer look."""
+    from matplotlib import pyplot as plt
+    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+    field, grid = placed(body), grid_of(resolution)
+    figure, axes = plt.subplots(
+        1,
+        len(PICTURED),
+        figsize=(4 * len(PICTURED), 4.4),
+        subplot_kw={"projection": "3d"},
+    )
+    light = np.array([0.4, -0.5, 0.77])
+    for axis, label in zip(axes, PICTURED, strict=True):
+        mesh = extract(field, grid, method=METHODS[label]).mesh
+        corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals = cross / np.linalg.norm(cross, axis=1, keepdims=True)
+        shade = 0.35 + 0.6 * np.clip(normals @ light, 0, 1)
+        colors = shade[:, None] * np.array([0.75, 0.82, 0.95])
+        axis.add_collection3d(
+            Poly3DCollection(
+                corners, facecolors=colors, edgecolors=0.6 * colors, lw=0.2
+            )
+        )
+        axis.set(xlim=(-0.7, 0.7), ylim=(-0.7, 0.7), zlim=(-0.7, 0.7), title=label)
+        axis.set_box_aspect((1, 1, 1), zoom=1.5)
+        axis.set_axis_off()
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+
+
 def main():
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--resolution", type=int, default=64)
+    parser.add_argument("--picture", help="write a picture here, and no tables")
     options = parser.parse_args()
+    if options.picture:
+        return picture(options.picture, BODIES["box less cylinder"], 24)
     print("| body | method | faces | edge mean | rms | max | off mean | max | angle |")
     for name, body in BODIES.items():
         report(name, body, grid_of(options.resolution))
