@@ -57,7 +57,7 @@ def bodies():
         "metaballs": jf.Metaballs(
             drops, (0.7, 0.6, 0.7, 0.5), (1.0, 1.0, 1.0, 1.0), 0.3
         ),
-        "tanglecube": jf.tanglecube().within((-2.6,) * 3, (2.6,) * 3).scale(0.4),
+        "tanglecube": jf.tanglecube().within((-2.6,) * 3, (2.6,) * 3).scale(0.3),
         "Barth sextic": ~jf.barth_sextic().within((-1.6,) * 3, (1.6,) * 3).scale(0.6)
         & ball,
         "Clebsch cubic": jf.clebsch_cubic()
