@@ -10,6 +10,8 @@ from ._field import Shell as Shell
 from ._field import SmoothUnion as SmoothUnion
 from ._field import Transformed as Transformed
 from ._field import Union as Union
+from ._narrow_band import NarrowBand as NarrowBand
+from ._narrow_band import narrow_band as narrow_band
 from ._primitives import Box as Box
 from ._primitives import Capsule as Capsule
 from ._primitives import Cylinder as Cylinder
