@@ -70,7 +70,9 @@ def main():
     arguments = parser.parse_args()
     run = band if arguments.form == "band" else dense
     method = MarchingCubes(normals=arguments.normals)
-    print(f"{arguments.field} {arguments.resolution}^3 {arguments.form}, start {_peak():.2f} GiB")
+    print(
+        f"{arguments.field} {arguments.resolution}^3 {arguments.form}, start {_peak():.2f} GiB"
+    )
     for _ in range(arguments.repeat):
         out, seconds = run(FIELDS[arguments.field], arguments.resolution, method)
         parts = " + ".join(f"{s:.2f}" for s in seconds)

@@ -16,6 +16,7 @@ import argparse
 import os
 import pathlib
 import time
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -24,9 +25,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxgeom import PointCloud, Rigid, stack
+from jaxgeom.neighbors import AbstractBackend, CellList, HostTree
 from jaxgeom.normals import estimate
 from jaxgeom.pipelines import register
-from jaxgeom.registration import icp
+from jaxgeom.registration import Method, Nearest, icp
 
 try:
     import small_gicp
@@ -111,32 +113,48 @@ def prepared(points):
     return PointCloud(jnp.asarray(points, jnp.float32))
 
 
-# One program for both sides. Within one program XLA on the CPU may run two independent
-# loops at once, and then wait forever for threads that wait for each other.
-oriented = eqx.filter_jit(lambda cloud: estimate(cloud, k=NEIGHBORS))
+class Ours(eqx.Module):
+    """Normals of both sides, then `icp`, with one way to find neighbors.
 
-
-@eqx.filter_jit
-def aligned(source, target, start, gate):
-    """The alignment of clouds with normals."""
-    return icp(source, target, init=start, max_distance=gate, max_steps=MOST_STEPS)
-
-
-def align(source, target, start, gate):
-    """One alignment from bare points: normals of both sides, then `icp`."""
-    return aligned(oriented(source), oriented(target), start, gate)
-
-
-@eqx.filter_jit
-def align_all(clouds, starts, gate):
-    """All alignments of a batch, one after the other in one program.
-
-    `clouds` holds the sources, and then the targets.
+    The normals of both sides are one program called twice: within one program XLA on
+    the CPU may run two independent loops at once, and then wait forever for threads
+    that wait for each other.
     """
-    clouds = jax.lax.map(lambda cloud: estimate(cloud, k=NEIGHBORS), clouds)
-    half = starts.translation.shape[0]
-    sides = [jax.tree.map(lambda x, i=i: x[i : i + half], clouds) for i in (0, half)]
-    return jax.lax.map(lambda item: aligned(*item, gate), (*sides, starts))
+
+    cells: AbstractBackend
+    pairs: AbstractBackend
+
+    @eqx.filter_jit
+    def oriented(self, cloud):
+        return estimate(cloud, k=NEIGHBORS, backend=self.cells)
+
+    @eqx.filter_jit
+    def aligned(self, source, target, start, gate):
+        method = Method(correspondence=Nearest(backend=self.pairs))
+        given = dict(method=method, max_distance=gate, max_steps=MOST_STEPS)
+        return icp(source, target, init=start, **given)
+
+    def align(self, source, target, start, gate):
+        """One alignment from bare points."""
+        return self.aligned(self.oriented(source), self.oriented(target), start, gate)
+
+    @eqx.filter_jit
+    def align_all(self, clouds, starts, gate):
+        """All alignments of a batch, one after the other in one program.
+
+        `clouds` holds the sources, and then the targets.
+        """
+        clouds = jax.lax.map(self.oriented, clouds)
+        half = starts.translation.shape[0]
+        side = lambda i: jax.tree.map(lambda x: x[i : i + half], clouds)
+        items = (side(0), side(half), starts)
+        return jax.lax.map(lambda item: self.aligned(*item, gate), items)
+
+
+OURS = {
+    "icp": Ours(CellList(NEIGHBORS), CellList()),
+    "icp, host tree": Ours(HostTree(), HostTree()),
+}
 
 
 def rigid(table):
@@ -242,14 +260,14 @@ def one_pair(label, size, repeats, door):
     source, target, start, truth = pair_case(size)
     print(f"{label}: {len(source)} on {len(target)}")
     arguments = (prepared(source), prepared(target), rigid(start), jnp.float32(GATE))
-    runs = {"icp": lambda: jax.block_until_ready(align(*arguments))}
-    found = first("icp", runs["icp"])
+    call = lambda ours: jax.block_until_ready(ours.align(*arguments))
+    runs = {name: partial(call, ours) for name, ours in OURS.items()}
     center = source.mean(axis=0)
     told = lambda f: (
         note(table_of(f.target_from_source), truth, center)
         + f", {int(f.num_steps)} steps, status {int(f.result._value)}"
     )
-    notes = {"icp": told(found)}
+    notes = {name: told(first(name, run)) for name, run in runs.items()}
     if door:
         init = Rigid(start[:3, :3], start[:3, 3])
         runs["register"] = lambda: register(source, target, init=init, throw=False)
@@ -263,7 +281,7 @@ def one_pair(label, size, repeats, door):
 def gradient(label, size, repeats):
     """An alignment with its derivative beside the alignment alone."""
     source, target, start, _ = pair_case(size)
-    here, there = (oriented(prepared(x)) for x in (source, target))
+    here, there = (OURS["icp"].oriented(prepared(x)) for x in (source, target))
     arguments = (here, there, rigid(start), jnp.float32(GATE))
 
     def value(points, here, there, start, gate):
@@ -293,9 +311,8 @@ def many(count, size, repeats):
     clouds = jax.tree.map(number, clouds)
     starts = rigid(np.stack([item[2] for item in batch]))
     arguments = (clouds, starts, jnp.float32(GATE))
-    runs = {"icp": lambda: jax.block_until_ready(align_all(*arguments))}
-    found = first("icp", runs["icp"])
-    pick = lambda i: jax.tree.map(lambda x: x[i], found.target_from_source)
+    call = lambda ours: jax.block_until_ready(ours.align_all(*arguments))
+    runs = {name: partial(call, ours) for name, ours in OURS.items()}
     told = lambda tables: "median {:.4f} deg {:.4f} mm, worst {:.3f} {:.3f}".format(
         *_spread(
             [
@@ -304,9 +321,12 @@ def many(count, size, repeats):
             ]
         )
     )
-    steps = np.asarray(found.num_steps)
-    notes = {"icp": told([table_of(pick(i)) for i in range(count)])}
-    notes["icp"] += f", mean steps {steps.mean():.1f}"
+    notes = {}
+    for name, run in runs.items():
+        found = first(name, run)
+        pick = lambda i, t=found.target_from_source: jax.tree.map(lambda x: x[i], t)
+        notes[name] = told([table_of(pick(i)) for i in range(count)])
+        notes[name] += f", mean steps {np.mean(found.num_steps):.1f}"
     for name, peer in peers().items():
         runs[name] = lambda peer=peer: [peer(*item) for item in batch]
         notes[name] = told(runs[name]())

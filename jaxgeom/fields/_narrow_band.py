@@ -30,6 +30,7 @@ from ._bricks import (
     in_grid,
     morton,
 )
+from ._field import AbstractField, claims
 
 # Host form: bricks and boxes per call, so that one program serves every size.
 _BRICKS, _TOGETHER, _BOXES = 1024, 64, 32768
@@ -66,7 +67,7 @@ class NarrowBand(eqx.Module):
         grid: Grid,
         level: Float[Array, ""] | float = 0.0,
         *,
-        lipschitz: Float[Array, ""] | float,
+        lipschitz: Float[Array, ""] | float | None = None,
         width: Float[Array, ""] | float = 0.0,
         closed: bool = False,
     ) -> "NarrowBand":
@@ -77,15 +78,18 @@ class NarrowBand(eqx.Module):
 
         **Arguments:**
 
-        - `lipschitz`: L with |f(x) - f(y)| <= L |x - y|: 1 for distances and their
-          bounds. Too small a value loses parts of the surface, which the extraction
+        - `lipschitz`: L with |f(x) - f(y)| <= L |x - y|, by default what the field
+          claims. Too small a value loses parts of the surface, which the extraction
           reports where it meets the gap; `inf` keeps every brick.
         - `width`: keeps all points nearer than this to the surface, a length.
         - `closed`: surround the grid by a layer of outside nodes, so that a surface
           that leaves the grid is closed half a cell beyond its sides.
 
-        Raises `GeometryError` for more than 8192 nodes along an axis.
+        Raises `GeometryError` for more than 8192 nodes along an axis, or where
+        `lipschitz` is not given and the field claims no finite constant.
         """
+        if lipschitz is None and not jnp.isfinite(claims(field).lipschitz):
+            raise _no_slope(f"a field that claims {float(claims(field).lipschitz)}")
         sampler = _sampler(field, grid, level, lipschitz, width, closed)
         bricks, values = _sampled(sampler, _search(sampler))
         count = jnp.int32(len(bricks))
@@ -122,7 +126,7 @@ def narrow_band(
     grid: Grid,
     level: Float[Array, ""] | float = 0.0,
     *,
-    lipschitz: Float[Array, ""] | float,
+    lipschitz: Float[Array, ""] | float | None = None,
     capacity: int,
     width: Float[Array, ""] | float = 0.0,
     closed: bool = False,
@@ -131,7 +135,8 @@ def narrow_band(
     """`NarrowBand.around` at a fixed capacity of bricks, for use under jit, vmap, grad.
 
     The values have the derivatives of the field; which bricks are kept has none.
-    `chunk` nodes are evaluated at a time.
+    `chunk` nodes are evaluated at a time. Where the field is no `AbstractField`,
+    `lipschitz` must be given; one that claims none, or infinity, keeps every brick.
 
     **Statuses:** `capacity_exceeded`, with the need in `required_bricks` (a lower
     estimate where a coarse level of the search overflowed: raise it again);
@@ -145,8 +150,13 @@ def narrow_band(
                 "Measure it: `NarrowBand.around(...).num_bricks`.",
             )
         )
+    if lipschitz is None and not isinstance(field, AbstractField):
+        raise _no_slope("a function that claims nothing")
     sampler = _sampler(field, grid, level, lipschitz, width, closed)
-    fixed = jax.tree.map(lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, sampler)
+    # Which bricks are kept is piecewise constant: it has no derivative.
+    fixed = jax.tree.map(
+        lambda x: lax.stop_gradient(x) if eqx.is_array(x) else x, sampler
+    )
     bricks, count, needed = find_bricks(fixed, capacity, chunk)
     together = max(1, min(chunk // NODES**3, capacity))
     values = lax.map(sampler.brick, bricks, batch_size=together)
@@ -157,8 +167,20 @@ def narrow_band(
     return NarrowBand(sampler.grid, bricks, values, count, needed, result)
 
 
+def _no_slope(given):
+    return GeometryError(
+        message(
+            "a narrow band needs a finite Lipschitz constant of its field",
+            given,
+            "Pass lipschitz=..., or inf to sample everywhere.",
+        )
+    )
+
+
 def _sampler(field, grid, level, lipschitz, width, closed):
     check_size(grid)
+    if lipschitz is None:
+        lipschitz = claims(field).lipschitz
     dtype = jnp.result_type(grid.origin, grid.spacing, float)
     origin, spacing = (jnp.asarray(x, dtype) for x in (grid.origin, grid.spacing))
     grid = Grid(origin, spacing, grid.shape)

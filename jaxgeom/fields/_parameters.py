@@ -16,12 +16,17 @@ def scalar(x) -> Float[Array, ""]:
     return x
 
 
-def vector(name: str) -> Callable:
-    """A converter to floating arrays [3] whose error names the parameter."""
+def vector(name: str, size: int = 3) -> Callable:
+    """A converter to floating arrays [size] whose error names the parameter."""
+    return array(name, size)
 
-    def convert(x) -> Float[Array, " 3"]:
+
+def array(name: str, *shape: int | None) -> Callable:
+    """A converter to floating arrays of a shape (None: any size)."""
+
+    def convert(x) -> Float[Array, "..."]:
         x = _floating(x)
-        check_shape(name, x, (3,))
+        check_shape(name, x, shape)
         return x
 
     return convert

@@ -4,11 +4,14 @@ After the collection of I. Quilez ("distance functions"), with safe norms: the u
 formulas have a NaN gradient at centers, on axes and inside boxes.
 """
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import safe_divide, safe_norm, safe_normalize
+from ._claims import Bounds, Claims
 from ._field import AbstractField
 from ._parameters import scalar, vector
 
@@ -24,6 +27,9 @@ class Sphere(AbstractField):
     def evaluate(self, point):
         return safe_norm(point - self.center) - self.radius
 
+    def claims(self):
+        return distance_about(self.center, self.radius)
+
 
 class Box(AbstractField):
     """The box of half extents [3] about its center. Exact distance."""
@@ -32,7 +38,10 @@ class Box(AbstractField):
     center: Float[Array, " 3"] = eqx.field(converter=vector("center"), default=_ORIGIN)
 
     def evaluate(self, point):
-        return _orthant(jnp.abs(point - self.center) - self.half_extents)
+        return orthant(jnp.abs(point - self.center) - self.half_extents)
+
+    def claims(self):
+        return distance_about(self.center, self.half_extents)
 
 
 class RoundedBox(AbstractField):
@@ -47,7 +56,10 @@ class RoundedBox(AbstractField):
 
     def evaluate(self, point):
         core = self.half_extents - self.radius
-        return _orthant(jnp.abs(point - self.center) - core) - self.radius
+        return orthant(jnp.abs(point - self.center) - core) - self.radius
+
+    def claims(self):
+        return distance_about(self.center, self.half_extents)
 
 
 class Torus(AbstractField):
@@ -65,6 +77,11 @@ class Torus(AbstractField):
         ring = jnp.stack([safe_norm(p[:2]) - self.major, p[2]])
         return safe_norm(ring) - self.minor
 
+    def claims(self):
+        outer = self.major + self.minor
+        reach = jnp.stack([outer, outer, self.minor])
+        return distance_about(self.center, reach)
+
 
 class Capsule(AbstractField):
     """The points within `radius` of the segment from start to end. Exact distance."""
@@ -78,6 +95,11 @@ class Capsule(AbstractField):
         along = jnp.clip(safe_divide(jnp.dot(p, axis), jnp.dot(axis, axis)), 0, 1)
         return safe_norm(p - along * axis) - self.radius
 
+    def claims(self):
+        low = jnp.minimum(self.start, self.end) - self.radius
+        high = jnp.maximum(self.start, self.end) + self.radius
+        return Claims.distance(Bounds.of(low, high))
+
 
 class Cylinder(AbstractField):
     """The capped cylinder along z, |z| <= half_height about its center. Exact."""
@@ -89,7 +111,11 @@ class Cylinder(AbstractField):
     def evaluate(self, point):
         p = point - self.center
         side, cap = safe_norm(p[:2]) - self.radius, jnp.abs(p[2]) - self.half_height
-        return _orthant(jnp.stack([side, cap]))
+        return orthant(jnp.stack([side, cap]))
+
+    def claims(self):
+        reach = jnp.stack([self.radius, self.radius, self.half_height])
+        return distance_about(self.center, reach)
 
 
 class Ellipsoid(AbstractField):
@@ -102,6 +128,12 @@ class Ellipsoid(AbstractField):
         stretched = safe_norm((point - self.center) / self.radii)
         return jnp.min(self.radii) * (stretched - 1)
 
+    def claims(self):
+        low, high = self.center - self.radii, self.center + self.radii
+        # |u| - 1 >= max |u_i| - 1 >= gap / radius, and a gap has three parts.
+        growth = jnp.min(self.radii) / jnp.max(self.radii) / math.sqrt(3)
+        return Claims.bound(Bounds.of(low, high, growth))
+
 
 class Plane(AbstractField):
     """n . x - offset, n = normal / |normal|: the half space below. Exact distance."""
@@ -112,8 +144,17 @@ class Plane(AbstractField):
     def evaluate(self, point):
         return jnp.dot(point, safe_normalize(self.normal)) - self.offset
 
+    def claims(self):
+        return Claims.distance(Bounds.everywhere())
 
-def _orthant(q):
+
+def distance_about(center, reach) -> Claims:
+    """The claims of the distance of a body within `reach` (a number or [d]) of a center
+    along each axis."""
+    return Claims.distance(Bounds.of(center - reach, center + reach))
+
+
+def orthant(q):
     """The signed distance to the set where all q <= 0: |max(q, 0)| or max(q)."""
     deepest = jnp.max(q)
     # One branch each, not their sum, which has half the gradient on the surface.

@@ -6,6 +6,10 @@ from ._ambiguity import SeparateInside as SeparateInside
 from ._brick_cubes import count_on_bricks as count_on_bricks
 from ._brick_cubes import marching_cubes_on_bricks as marching_cubes_on_bricks
 from ._classify import Counts as Counts
+from ._dual_contouring import DualContouring as DualContouring
+from ._dual_contouring import dual_contouring as dual_contouring
+from ._dual_marching_cubes import DualMarchingCubes as DualMarchingCubes
+from ._dual_marching_cubes import dual_marching_cubes as dual_marching_cubes
 from ._extract import extract as extract
 from ._extract import pad_outside as pad_outside
 from ._extraction import Capacity as Capacity

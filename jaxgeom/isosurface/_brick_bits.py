@@ -1,4 +1,4 @@
-"""Classify the bricks of a narrow band: as `_classify.py`, with a word per row of nodes.
+"""Classify the bricks of a narrow band: as `_classify.py`, a word per row of nodes.
 
 A row of 8 nodes along z owns 24 edges, 8 along each axis, and 8 cells: one word of 32
 bits. Edges, faces and cells belong to the brick of their lowest node, so that what
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, UInt
+from jaxtyping import Array, Bool, Int, UInt
 
 from .._core import prefix_sum, stage
 from ..fields import NarrowBand
@@ -155,7 +155,10 @@ def _gaps(inside, band, ahead, real):
         x, y = (slice(SIZE, None) if one else slice(None) for one in step[:2])
         rows = inside[:, x, y].reshape(size, -1)
         bits = jnp.uint16(1 << SIZE) if c >> 2 else every
-        none, full = jnp.all(rows & bits == 0, axis=1), jnp.all(~rows & bits == 0, axis=1)
+        none, full = (
+            jnp.all(rows & bits == 0, axis=1),
+            jnp.all(~rows & bits == 0, axis=1),
+        )
         exists = jnp.all(SIZE * (band.bricks + step) < shape, axis=1)
         out.append(~(none | full) & exists & (ahead[:, c] == size) & real)
     return jnp.stack(out, axis=1)
@@ -169,7 +172,7 @@ def _exist(band, real):
     left = jnp.clip(np.array(band.grid.shape) - SIZE * band.bricks, 0, SIZE + 1)
     left = jnp.where(real[:, None], left, 0)
     within = [[_within(left, d, less) for less in (0, 1)] for d in range(3)]
-    # An edge, a face or a cell has an extent (1) along some axes, and none along others.
+    # Edges, faces and cells have an extent (1) along some axes, none along others.
     exist = lambda *extent: (
         within[0][extent[0]] & within[1][extent[1]] & within[2][extent[2]]
     )
@@ -182,7 +185,9 @@ def _within(left, axis, less):
     """The bits [b, 8, 8] of rows whose place along an axis is below left - less."""
     limit = left[:, axis, None, None] - less
     if axis == 2:
-        return jnp.broadcast_to(below(jnp.clip(limit, 0, SIZE)), (len(left), SIZE, SIZE))
+        return jnp.broadcast_to(
+            below(jnp.clip(limit, 0, SIZE)), (len(left), SIZE, SIZE)
+        )
     place = jnp.arange(SIZE)[:, None] if axis == 0 else jnp.arange(SIZE)
     return jnp.where(place < limit, jnp.uint32(_LOW), jnp.uint32(0))
 

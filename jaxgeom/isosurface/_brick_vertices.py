@@ -95,7 +95,9 @@ def edges_of(owners: Owners, rows, words) -> BrickEdges:
     return BrickEdges(row >> 6, node, place >> 3)
 
 
-def brick_positions(t: Float[Array, " v"], samples: BrickSamples) -> Float[Array, "v 3"]:
+def brick_positions(
+    t: Float[Array, " v"], samples: BrickSamples
+) -> Float[Array, "v 3"]:
     """The points at parameter t of every edge."""
     edges, grid = samples.edges, samples.band.grid
     bricks = samples.band.bricks.at[edges.brick].get(mode="clip")

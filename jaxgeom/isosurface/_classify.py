@@ -56,7 +56,7 @@ def classify(
     halves = stage(token, _halves, values, level)
     inside, finite = stage(token, _join_halves, halves)
     bits = stage(token, lambda i, f: _bits(i, f, nz), inside, finite)
-    corners = stage(token, _corner_words, bits.inside)
+    corners = stage(token, corner_words, bits.inside)
     num_faces = stage(token, count_faces, corners, bits.cells)
     decided = rule.joined(values, level, token)
     if decided is not None:
@@ -159,7 +159,8 @@ def count_faces(corners, active):
     return jnp.sum(cut - 2 * euler - 4 * rings)
 
 
-def _corner_words(inside):
+def corner_words(inside):
+    """The inside bits of the 8 corners of the cells, corner x + 2y + 4z."""
     along_x = [inside, _next(inside, 0)]
     along_xy = [*along_x, *(_next(w, 1) for w in along_x)]
     return [*along_xy, *(_next_z(w) for w in along_xy)]

@@ -36,7 +36,8 @@ def extract(
     - `field`: [x, y, z] samples at the nodes of `grid`, or a function of one point [3],
       or a `NarrowBand`, which has its own grid and level: work and memory then grow
       with the area of the surface.
-    - `method`: the settings of an extractor; of a band, `MarchingCubes`.
+    - `method`: the settings of an extractor. It is given the samples and, where
+      `field` is a function, the function as `field=`. A band takes `MarchingCubes`.
     - `closed`: surround the grid by a layer of outside nodes, so that a surface that
       leaves the grid is closed half a cell beyond its sides.
 
@@ -48,14 +49,16 @@ def extract(
     if isinstance(field, NarrowBand):
         _check_band(grid, method, closed)
         return extract_band(field, method, token)
-    values = _sample(field, grid) if callable(field) else jnp.asarray(field)
+    function = field if callable(field) else None
+    values = jnp.asarray(field) if function is None else _sample(field, grid)
     # A Python number would be a constant of the program: one compilation per level.
     level = jnp.asarray(level, jnp.result_type(values.dtype, float))
     if closed:
         values, grid = _pad(values, grid, level)
     needed = jax.device_get(_measure(method, values, level, token))
     sizes = (int(needed.vertices), int(needed.faces), int(needed.cells))
-    out = _run(method, values, grid, level, Capacity.holding(*sizes), token)
+    capacity = Capacity.holding(*sizes)
+    out = _run(method, values, grid, level, capacity, function, token)
     return eqx.tree_at(lambda e: e.mesh, out, out.mesh.trim())
 
 
@@ -109,5 +112,5 @@ def _measure(method, values, level, token):
 
 
 @eqx.filter_jit
-def _run(method, values, grid, level, capacity, token):
-    return method(values, grid, level, capacity=capacity, token=token)
+def _run(method, values, grid, level, capacity, field, token):
+    return method(values, grid, level, capacity=capacity, field=field, token=token)

@@ -55,7 +55,7 @@ def emit_faces(bits: Bits, numbers: Numbers, capacity: Capacity, token) -> Faces
 def _places(owners: Owners, bits, tables: CaseTables):
     words = bits.cells.reshape(-1).at[owners.owner].get(mode="promise_in_bounds")
     bit = select(words, owners.place)
-    row = _case(bits.inside, owners.owner, bit)
+    row = corner_signs(bits.inside, owners.owner, bit)
     if tables.row is not None:
         row = jnp.asarray(tables.row)[
             row << 6 | _joined(bits.joined, owners.owner, bit)
@@ -78,7 +78,7 @@ def _joined(joined, word, bit):
     return out
 
 
-def _case(inside, word, bit):
+def corner_signs(inside, word, bit):
     """The 8 corner signs of each cell as a number, corner x + 2y + 4z."""
     _, ny, per_line = inside.shape
     flat = inside.reshape(-1)
@@ -133,12 +133,19 @@ def _codes(slots: Owners, cells, tables) -> _Codes:
 
 
 def _vertex_number(codes, numbers, cut, i):
-    """First vertex of the word and axis + number of cut edges at lower bits."""
-    code = codes.edges >> CODE_BITS * i
+    """The vertex on the edge number i of every face."""
+    return edge_rank(codes.word, codes.bit, codes.edges >> CODE_BITS * i, numbers, cut)
+
+
+def edge_rank(word, bit, code, numbers: Numbers, cut) -> Int[Array, " k"]:
+    """The number of a cut edge of a cell, the code of 5 bits relative to its corner.
+
+    First vertex of the word and axis + number of cut edges at lower bits.
+    """
     axis, dx, dy, dz = code & 3, code >> 2 & 1, code >> 3 & 1, code >> 4 & 1
     _, _, ny, per_line = cut.shape
-    bit = codes.bit + dz
-    word = codes.word + (dx * ny + dy) * per_line + (bit >> _BIT)
+    bit = bit + dz
+    word = word + (dx * ny + dy) * per_line + (bit >> _BIT)
     index = axis * numbers.first_vertex.shape[1] + word
     first = numbers.first_vertex.reshape(-1).at[index].get(mode="clip")
     edges = cut.reshape(-1).at[index].get(mode="clip")

@@ -52,8 +52,11 @@ class MarchingCubes(eqx.Module):
     ambiguity: AbstractFaceRule = _SEPARATE
     normals: bool = eqx.field(static=True, default=True)
 
-    def __call__(self, values, grid, level=0.0, *, capacity, token=None) -> Extraction:
-        """The level set of sampled values; see `marching_cubes`."""
+    def __call__(
+        self, values, grid, level=0.0, *, capacity, field=None, token=None
+    ) -> Extraction:
+        """The level set of sampled values; see `marching_cubes`. The field behind them
+        is not used."""
         return marching_cubes(
             values,
             grid,
@@ -105,8 +108,8 @@ def marching_cubes(
     Raises `GeometryError` unless `values` has the shape of the grid, or if vertex
     numbers might not fit 32 bits.
     """
-    values, level = _as_float(values, level)
-    _check(values, grid)
+    values, level = as_float(values, level)
+    check_grid(values, grid)
     # The sign of a sample is piecewise constant: the topology has no derivative.
     bits, numbers = classify(*lax.stop_gradient((values, level)), ambiguity, token)
     edges = find_edges(bits, numbers, values.shape[2], capacity.vertices, token)
@@ -123,7 +126,7 @@ def marching_cubes(
     mesh = TriangleMesh(
         vertices, faces.corners, directed, None, num_vertices, faces.num_faces
     )
-    return _finish(mesh, numbers.needed, bits.finite, capacity)
+    return finish(mesh, numbers.needed, bits.finite, capacity)
 
 
 def count(
@@ -138,10 +141,11 @@ def count(
     With a decider the number of faces is an upper bound, near where faces of the grid
     are seldom ambiguous.
     """
-    return classify(*_as_float(values, level), ambiguity, token)[1].needed
+    return classify(*as_float(values, level), ambiguity, token)[1].needed
 
 
-def _as_float(values, level):
+def as_float(values, level):
+    """Values and level as numbers of one floating type."""
     values = jnp.asarray(values)
     if not jnp.issubdtype(values.dtype, jnp.floating):
         values = values.astype(float)
@@ -153,7 +157,8 @@ def _parameter(placement, values, edges, level):
     return jnp.clip(t, CLEARANCE, 1 - CLEARANCE)
 
 
-def _check(values, grid):
+def check_grid(values, grid):
+    """Raise unless the values have the shape of the grid and edges fit 32 bits."""
     check_shape("values", values, grid.shape)
     if np.prod(np.asarray(grid.shape, float)) * 3 >= 2**31:
         raise GeometryError(
@@ -165,7 +170,8 @@ def _check(values, grid):
         )
 
 
-def _finish(mesh, needed, finite, capacity) -> Extraction:
+def finish(mesh, needed, finite, capacity) -> Extraction:
+    """The mesh with its status."""
     short = (
         (needed.vertices > capacity.vertices)
         | (needed.faces > capacity.faces)

@@ -1,5 +1,6 @@
 """Exact nearest neighbors among points and on triangle meshes."""
 
+from ._backends import AbstractBackend as AbstractBackend
 from ._backends import AbstractIndex as AbstractIndex
 from ._brute import BruteForce as BruteForce
 from ._brute import BruteIndex as BruteIndex

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core import prefix_sum
-from ._backends import AbstractBackend, AbstractIndex, in_tiles, usable
+from ._backends import AbstractBackend, AbstractIndex, usable
 from ._morton import LEVELS, bounds, curve, morton_order, occupied_cells
-from ._tree import Tree, grow, insert, search_tree
+from ._tree import Nearest, Tree, grow, insert, search_tree
 
 _LEAF = 8
 _LANES = 256
@@ -23,11 +23,11 @@ _LANES = 256
 _FEW = 256
 # From so many neighbors on it pays to sort queries by the length of their lists.
 _MANY = 4
-_SMALLEST_TILE = 1024
-# Lists of k candidates per query of a tile should stay in the cache.
-_TILE_ENTRIES = 4096
+# Queries of a tile of the first look: their lists should stay in the cache.
+_TILE = 1024
 _SMALLEST_TABLE, _LARGEST_TABLE = 2**12, 2**24
 _CELLS_PER_POINT = 16
+_NEVER = 2**30
 
 
 class CellIndex(AbstractIndex):
@@ -146,16 +146,19 @@ def _cell_id(cell, counts):
 
 
 def _search_near(index, queries, active, k, reach) -> _Near:
-    """Every query in the cells around it, lists of similar length together."""
-    look = lambda rows: _search_cells(index, *rows, k, reach, index.span)
-    size = max(_SMALLEST_TILE, _TILE_ENTRIES // k)
-    if k < _MANY or queries.shape[0] <= size:
-        return in_tiles(look, (queries, active), size)
-    length = jnp.where(active, _block(index, queries, index.span).total, 0)
-    number = jnp.arange(queries.shape[0], dtype=jnp.int32)
-    _, order = jax.lax.sort((length, number), num_keys=1)
-    near = in_tiles(look, (queries[order], active[order]), size)
-    return jax.tree.map(lambda x: jnp.zeros_like(x).at[order].set(x), near)
+    """Every active query in the cells around it, lists of similar length together."""
+    q = queries.shape[0]
+    rows, count = _listed(active)
+    if k >= _MANY and q > _TILE:
+        length = jnp.where(active, _block(index, queries, index.span).total, _NEVER)
+        _, rows = jax.lax.sort((length, jnp.arange(q, dtype=jnp.int32)), num_keys=1)
+    blank = _Near(
+        jnp.full((q, k), index.points.shape[0], jnp.int32),
+        jnp.full(q, reach, queries.dtype),
+        ~active,
+    )
+    queue = (rows, count)
+    return _search_tiles(index, queries, queue, blank, k, reach, index.span, _TILE)
 
 
 class _Block(eqx.Module):
@@ -200,16 +203,17 @@ def _search_cells(index, queries, active, k, reach, span) -> _Near:
     block = _block(index, queries, span)
     longest = index.longest * span**2 // 4
     length = jnp.where(active, jnp.minimum(block.total, longest), 0)
-    squares, places = _nearest_in_list(index, queries, block, length, longest, k)
+    near = _nearest_in_list(index, queries, block, length, longest, k)
+    squares = near.squares
     there = (squares <= reach) & (squares < jnp.inf)
-    positions = jnp.where(there, block.position(places), n)
+    positions = jnp.where(there, block.position(near.items), n)
     found = index.order.at[positions].get(mode="fill", fill_value=n)
     room = _room(index, queries, block.first, block.final)
     least = jnp.minimum(squares[-1], reach)
     return _Near(found.T, least, (block.total <= longest) & (least <= room))
 
 
-def _nearest_in_list(index, queries, block, length, longest, k):
+def _nearest_in_list(index, queries, block, length, longest, k) -> Nearest:
     """The k smallest squared distances [k, t] of each list, and their list indices.
 
     Distances are written down before they are compared: XLA would compute a gather
@@ -227,10 +231,10 @@ def _nearest_in_list(index, queries, block, length, longest, k):
 
     blank = jnp.full((longest, queries.shape[0]), jnp.inf, queries.dtype)
     table = jax.lax.fori_loop(0, steps, measure, blank)
-    empty = [jnp.full_like(length, jnp.inf, queries.dtype)] * k, [length * 0] * k
-    take = lambda j, best: insert(*best, table[j], j)
-    squares, places = jax.lax.fori_loop(0, steps, take, empty)
-    return jnp.stack(squares), jnp.stack(places)
+    rows = (k, queries.shape[0])
+    empty = Nearest(jnp.full(rows, jnp.inf, queries.dtype), jnp.zeros(rows, jnp.int32))
+    take = lambda j, best: insert(best, table[j], j)
+    return jax.lax.fori_loop(0, steps, take, empty)
 
 
 def _room(index, queries, first, final):
@@ -250,15 +254,23 @@ def _room(index, queries, first, final):
 
 def _search_wider(index, queries, wanted, near, k, reach) -> _Near:
     """`near`, with the wanted rows searched in more cells."""
+    queue, span = _listed(wanted), index.span + 2
+    return _search_tiles(index, queries, queue, near, k, reach, span, _FEW)
+
+
+def _search_tiles(index, queries, queue, near, k, reach, span, size) -> _Near:
+    """`near`, with the first `count` of the rows searched, a tile of them at a time."""
+    rows, count = queue
     q = queries.shape[0]
-    size = min(_FEW, q)
-    rows, count = _listed(wanted)
+    size = min(size, q)
     rows = jnp.pad(rows, (0, -q % size), constant_values=q)
+    number = jnp.arange(size, dtype=jnp.int32)
 
     def tile(i, near):
         row = jax.lax.dynamic_slice(rows, (i * size,), (size,))
+        row = jnp.where(i * size + number < count, row, q)
         points = queries.at[row].get(mode="fill", fill_value=0)
-        found = _search_cells(index, points, row < q, k, reach, index.span + 2)
+        found = _search_cells(index, points, row < q, k, reach, span)
         put = lambda to, x: to.at[row].set(x, mode="drop")
         return jax.tree.map(put, near, found)
 

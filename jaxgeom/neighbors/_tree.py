@@ -176,16 +176,15 @@ def _visit(tree: Tree, lane: _Lanes, squares: Callable) -> _Lanes:
     slots = slot + jnp.arange(tree.leaf, dtype=jnp.int32)[:, None]
     found = squares(slots, lane.point)
     found = jnp.where(there & jnp.isfinite(found), found, jnp.inf)
-    take = lambda j, best: insert(*best, found[j], slots[j])
-    best = (list(lane.best.squares), list(lane.best.items))
-    best = jax.lax.fori_loop(0, tree.leaf, take, best)
+    take = lambda j, best: insert(best, found[j], slots[j])
+    best = jax.lax.fori_loop(0, tree.leaf, take, lane.best)
     node, trail = _next(lane.node, lane.trail)
     return _Lanes(
         lane.row,
         jnp.where(there, node, lane.node),
         jnp.where(there, trail, lane.trail),
         lane.point,
-        Nearest(*map(jnp.stack, best)),
+        best,
     )
 
 
@@ -208,16 +207,18 @@ def _box_squares(tree: Tree, node, point) -> Float[Array, " t"]:
     return sum(gap(d) ** 2 for d in range(3))
 
 
-def insert(squares, items, square, item):
-    """One more candidate [t] into ascending lists, given row by row: k arrays [t].
+def insert(best: Nearest, square: Float[Array, " t"], item) -> Nearest:
+    """The lists with one more candidate for every lane, `item` [t] or one for all.
 
-    As rows, not as one array [k, t], whose shifted copies XLA does not vectorize.
+    A row of the sorted list becomes the middle one of itself, the row before it and the
+    newcomer. Equal distances keep their order.
     """
-    rows = list(zip(squares, items, strict=True))
-    ahead = [(jnp.full_like(square, -jnp.inf), items[0]), *rows[:-1]]
-    old = [(*row, above) for row, above in zip(rows, ahead, strict=True)]
-    squares = [jnp.minimum(s, jnp.maximum(above, square)) for s, _, (above, _) in old]
-    place = lambda s, i, above: jnp.where(
-        square < s, jnp.where(square < above[0], above[1], item), i
-    )
-    return squares, [place(*row) for row in old]
+    if best.items.shape[0] == 1:
+        closer = square < best.squares
+        pick = lambda new, old: jnp.where(closer, new, old)
+        return Nearest(pick(square, best.squares), pick(item, best.items))
+    row_before = lambda x, fill: jnp.concatenate([jnp.full_like(x[:1], fill), x[:-1]])
+    nearer = row_before(best.squares, -jnp.inf)
+    squares = jnp.minimum(best.squares, jnp.maximum(nearer, square))
+    moved = jnp.where(square < nearer, row_before(best.items, 0), item)
+    return Nearest(squares, jnp.where(square < best.squares, moved, best.items))

@@ -6,12 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import safe_divide, safe_norm, safe_normalize
-from ..neighbors import CellList, Neighbors, build, knn
+from ..neighbors import AbstractBackend, CellList, Neighbors, build, knn
 from ..shapes import PointCloud
 from ._frames import frames
 
 
-def estimate(cloud: PointCloud, *, k: int = 16) -> PointCloud:
+def estimate(
+    cloud: PointCloud, *, k: int = 16, backend: AbstractBackend | None = None
+) -> PointCloud:
     """The cloud with unit normals: the direction in which k neighbors spread least.
 
     n = the eigenvector of the smallest eigenvalue of sum_j (x_j - c)(x_j - c)^T, over
@@ -19,11 +21,12 @@ def estimate(cloud: PointCloud, *, k: int = 16) -> PointCloud:
     with `orient_toward_viewpoint` or `orient_consistently`. Where the neighbors are
     fewer than three, or coincide, or lie on a line, the normal is zero. Differentiable
     in the points; the neighbors are constants, and the gradient is zero where the
-    smallest eigenvalue is not simple.
+    smallest eigenvalue is not simple. `backend` finds the neighbors (see
+    `neighbors.build`): `CellList(k)` by default.
 
     Source: Hoppe et al. 1992, Surface reconstruction from unorganized points, 3.1.
     """
-    normals = local_normals(cloud, nearby(cloud, k))
+    normals = local_normals(cloud, nearby(cloud, k, backend))
     return eqx.tree_at(lambda c: c.normals, cloud, normals, is_leaf=lambda x: x is None)
 
 
@@ -41,10 +44,13 @@ def plane_residual(cloud: PointCloud, *, k: int = 16) -> Float[Array, " n"]:
     return safe_norm(height) / jnp.sqrt(count)
 
 
-def nearby(cloud: PointCloud, k: int) -> Neighbors:
+def nearby(
+    cloud: PointCloud, k: int, backend: AbstractBackend | None = None
+) -> Neighbors:
     """The k nearest points of every point of a cloud, itself among them."""
     points = cloud.washed().points
-    index = build(points, cloud.mask, backend=CellList(k))
+    backend = CellList(k) if backend is None else backend
+    index = build(points, cloud.mask, backend=backend)
     return knn(index, points, k, mask=cloud.mask)
 
 

@@ -1,5 +1,6 @@
 """Alignment: closest points by composition, features, consensus among wrong pairs."""
 
+from ._anderson import Anderson as Anderson
 from ._correspondences import ClosestSurface as ClosestSurface
 from ._correspondences import DistanceField as DistanceField
 from ._correspondences import Facing as Facing
@@ -19,13 +20,8 @@ from ._global import describe_view as describe_view
 from ._gnc import gnc as gnc
 from ._gnc import robust_procrustes as robust_procrustes
 from ._graph import EmbeddedGraph as EmbeddedGraph
-from ._icp import Degeneracy as Degeneracy
-from ._icp import Method as Method
-from ._icp import PreparedTarget as PreparedTarget
-from ._icp import Registration as Registration
 from ._icp import icp as icp
 from ._icp import icp_unrolled as icp_unrolled
-from ._icp import prepare_target as prepare_target
 from ._kernels import L2 as L2
 from ._kernels import AnnealedWidth as AnnealedWidth
 from ._kernels import Cauchy as Cauchy
@@ -58,6 +54,11 @@ from ._objectives import PointToSurface as PointToSurface
 from ._objectives import Symmetric as Symmetric
 from ._ransac import Consensus as Consensus
 from ._ransac import ransac as ransac
+from ._report import Degeneracy as Degeneracy
+from ._report import Registration as Registration
+from ._scene import Method as Method
+from ._scene import PreparedTarget as PreparedTarget
+from ._scene import prepare_target as prepare_target
 from ._solvers import Alternation as Alternation
 from ._solvers import GaussNewton as GaussNewton
 from ._solvers import LeastSquares as LeastSquares

@@ -14,14 +14,28 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._core import GeometryError, message, safe_divide, safe_norm, safe_normalize
 from ..neighbors import (
+    AbstractBackend,
     AbstractIndex,
-    BruteForce,
-    CellList,
     build,
     closest_on_mesh,
     knn,
 )
 from ..shapes import PointCloud, TriangleMesh
+
+# How far beyond the gate points are searched.
+_BEYOND = 1.1
+
+
+class Memory(eqx.Module):
+    """What a search for nearest points says about later ones.
+
+    Where each source point was when it was searched, which target point was the nearest
+    (one past the last if all are too far), and how far every other one was at least.
+    """
+
+    points: Float[Array, "n 3"]
+    nearest: Int[Array, " n"]
+    apart: Float[Array, " n"]
 
 
 class Found(eqx.Module):
@@ -34,6 +48,7 @@ class Found(eqx.Module):
     indices: Int[Array, " n"]
     mask: Bool[Array, " n"]
     shares: Float[Array, "n 3"] | None = None
+    memory: Memory | None = None
 
 
 class Places(eqx.Module):
@@ -86,16 +101,23 @@ class AbstractCorrespondence(eqx.Module):
         """What is needed of the target, built once."""
 
     @abstractmethod
-    def find(self, prepared, moved: PointCloud, max_distance) -> Found:
-        """The pairs of the moved source, at most `max_distance` apart."""
+    def find(
+        self, prepared, moved: PointCloud, max_distance, last: Found | None
+    ) -> Found:
+        """The pairs of the moved source, at most `max_distance` apart.
+
+        `last` is what was found for the same source before it moved on, if anything.
+        """
 
     @abstractmethod
     def places(self, prepared, moved: PointCloud, found: Found) -> Places:
         """Where the pairs are."""
 
-    def match(self, prepared, moved: PointCloud, max_distance) -> Found:
+    def match(
+        self, prepared, moved: PointCloud, max_distance, last: Found | None = None
+    ) -> Found:
         """`find`, without the pairs that `check` refuses."""
-        found = self.find(prepared, moved, max_distance)
+        found = self.find(prepared, moved, max_distance, last)
         if self.check is None or moved.normals is None:
             return found
         places = self.places(prepared, moved, found)
@@ -109,59 +131,73 @@ class _Indexed(eqx.Module):
     index: AbstractIndex
 
 
-class Nearest(AbstractCorrespondence):
+class AbstractNearest(AbstractCorrespondence):
+    """The nearest target point, where it may be one of a pair.
+
+    A point is searched anew only when it has moved so far that another target point
+    could have become the nearest.
+    """
+
+    backend: eqx.AbstractVar[AbstractBackend | None]
+
+    @abstractmethod
+    def pairs(
+        self, moved: PointCloud, places: Places, found: Found
+    ) -> Bool[Array, " n"]:
+        """Which of the nearest points found make a pair."""
+
+    def prepare(self, target):
+        _check_target(target, PointCloud, "this correspondence")
+        target = jax.tree.map(jnp.asarray, target)
+        index = build(target.points, target.mask, backend=self.backend)
+        return _Indexed(target, index)
+
+    def find(self, prepared, moved, max_distance, last):
+        found = _nearest(prepared, moved, max_distance, last)
+        return _only(
+            found, self.pairs(moved, self.places(prepared, moved, found), found)
+        )
+
+    def places(self, prepared, moved, found):
+        points, normals = prepared.target.points, prepared.target.normals
+        there = points[found.indices]
+        if normals is None:
+            return Places(there, jnp.zeros_like(there))
+        return Places(there, normals[found.indices])
+
+
+class Nearest(AbstractNearest):
     """The nearest target point."""
 
     check: AbstractNormalCheck | None = None
-    backend: CellList | BruteForce | None = None
+    backend: AbstractBackend | None = None
 
-    def prepare(self, target):
-        return _prepare(target, self.backend)
-
-    def find(self, prepared, moved, max_distance):
-        return _nearest(prepared, moved, max_distance)
-
-    def places(self, prepared, moved, found):
-        return _points_at(prepared, found)
+    def pairs(self, moved, places, found):
+        return found.mask
 
 
-class Mutual(AbstractCorrespondence):
+class Mutual(AbstractNearest):
     """The nearest target point, if the moved source point nearest to it is this one."""
 
     check: AbstractNormalCheck | None = None
-    backend: CellList | BruteForce | None = None
+    backend: AbstractBackend | None = None
 
-    def prepare(self, target):
-        return _prepare(target, self.backend)
-
-    def find(self, prepared, moved, max_distance):
-        found = _nearest(prepared, moved, max_distance)
-        back = _way_back(moved, _points_at(prepared, found), found, self.backend)
-        return _only(found, back == jnp.arange(back.shape[0]))
-
-    def places(self, prepared, moved, found):
-        return _points_at(prepared, found)
+    def pairs(self, moved, places, found):
+        back = _way_back(moved, places, found, self.backend)
+        return back == jnp.arange(back.shape[0])
 
 
-class Reciprocal(AbstractCorrespondence):
+class Reciprocal(AbstractNearest):
     """The nearest target point, if the moved source point nearest to it is within
     `distance` of this one, in the unit of the target."""
 
     distance: Float[Array, ""] | float
     check: AbstractNormalCheck | None = None
-    backend: CellList | BruteForce | None = None
+    backend: AbstractBackend | None = None
 
-    def prepare(self, target):
-        return _prepare(target, self.backend)
-
-    def find(self, prepared, moved, max_distance):
-        found = _nearest(prepared, moved, max_distance)
-        back = _way_back(moved, _points_at(prepared, found), found, self.backend)
-        miss = safe_norm(moved.points[back] - moved.points)
-        return _only(found, miss <= self.distance)
-
-    def places(self, prepared, moved, found):
-        return _points_at(prepared, found)
+    def pairs(self, moved, places, found):
+        back = _way_back(moved, places, found, self.backend)
+        return safe_norm(moved.points[back] - moved.points) <= self.distance
 
 
 class ClosestSurface(AbstractCorrespondence):
@@ -177,7 +213,7 @@ class ClosestSurface(AbstractCorrespondence):
         _check_target(target, TriangleMesh, "ClosestSurface")
         return target
 
-    def find(self, prepared, moved, max_distance):
+    def find(self, prepared, moved, max_distance, last):
         near = closest_on_mesh(prepared, moved.points)
         mask = moved.mask & near.mask & (near.distances <= max_distance)
         return Found(near.faces, mask, near.barycentric)
@@ -210,7 +246,7 @@ class DistanceField(AbstractCorrespondence):
         _check_target(target, Callable, "DistanceField")
         return target
 
-    def find(self, prepared, moved, max_distance):
+    def find(self, prepared, moved, max_distance, last):
         value, slope = jax.vmap(jax.value_and_grad(prepared))(moved.points)
         square = jnp.sum(slope**2, axis=1)
         near = jnp.abs(value) <= max_distance * jnp.sqrt(square)
@@ -222,11 +258,6 @@ class DistanceField(AbstractCorrespondence):
         value, slope = jax.vmap(jax.value_and_grad(prepared))(points)
         foot = points - safe_divide(value, jnp.sum(slope**2, axis=1))[:, None] * slope
         return Places(foot, safe_normalize(slope))
-
-
-def _prepare(target, backend):
-    _check_target(target, PointCloud, "this correspondence")
-    return _Indexed(target, build(target.points, target.mask, backend=backend))
 
 
 def _check_target(target, kind, name):
@@ -241,20 +272,51 @@ def _check_target(target, kind, name):
         )
 
 
-def _nearest(prepared, moved, max_distance) -> Found:
-    near = knn(
-        *(prepared.index, moved.points, 1), mask=moved.mask, max_distance=max_distance
-    )
-    found = near.mask[:, 0]
-    return Found(jnp.where(found, near.indices[:, 0], 0), found)
+def _nearest(prepared, moved, max_distance, last) -> Found:
+    """The nearest points; only those points are searched that the last search leaves
+    in doubt (after L. Greenspan, G. Godin, A nearest neighbor method for efficient ICP,
+    2001)."""
+    # Beyond the gate, so that points without a pair need not be searched at once.
+    reach = _BEYOND * max_distance
+    memory = None if last is None else last.memory
+    sure = _still_nearest(prepared, moved, memory, max_distance)
+    index, points = prepared.index, jax.lax.stop_gradient(moved.points)
+    near = knn(index, points, 2, mask=moved.mask & ~sure, max_distance=reach)
+    apart = jnp.minimum(near.distances[:, 1], reach)
+    fresh = Memory(points, near.indices[:, 0], apart)
+    if memory is not None:
+        keep = lambda new, old: jnp.where(
+            sure.reshape(-1, *[1] * (new.ndim - 1)), old, new
+        )
+        fresh = jax.tree.map(keep, fresh, memory)
+    distance = _distance_to(prepared, points, fresh.nearest)
+    mask = moved.mask & (distance <= max_distance)
+    return Found(jnp.where(mask, fresh.nearest, 0), mask, memory=fresh)
 
 
-def _points_at(prepared, found) -> Places:
-    points, normals = prepared.target.points, prepared.target.normals
-    there = points[found.indices]
-    if normals is None:
-        return Places(there, jnp.zeros_like(there))
-    return Places(there, normals[found.indices])
+def _still_nearest(prepared, moved, memory, max_distance) -> Bool[Array, " n"]:
+    """Where what was nearest at the last search must be so still.
+
+    A point that has moved by s is at least `apart` - s from every other target point.
+    """
+    if memory is None:
+        return jnp.zeros(moved.mask.shape, bool)
+    points = jax.lax.stop_gradient(moved.points)
+    step = safe_norm(points - memory.points)
+    distance = _distance_to(prepared, points, memory.nearest)
+    # Without a nearest point it is enough that the others stay beyond the gate.
+    distance = jnp.minimum(distance, max_distance)
+    rounding = 32 * jnp.finfo(points.dtype).eps * jnp.max(jnp.abs(points))
+    return distance + rounding < memory.apart - step
+
+
+def _distance_to(prepared, points, nearest):
+    """The distance to the nearest points; infinite where there is none."""
+    there = jax.lax.stop_gradient(prepared.index.points)
+    there = there.at[nearest].get(mode="fill", fill_value=jnp.inf)
+    some = jnp.isfinite(there[:, 0])
+    gap = jnp.where(some[:, None], points - there, 0)
+    return jnp.where(some, safe_norm(gap), jnp.inf)
 
 
 def _way_back(moved, places, found, backend) -> Int[Array, " n"]:

@@ -32,7 +32,7 @@ from .._core import (
     message,
     safe_divide,
 )
-from ..neighbors import CellList, build, knn
+from ..neighbors import AbstractBackend, CellList, build, knn
 from ..shapes import PointCloud
 from ..transforms import Rigid
 from ._kernels import AbstractKernel, Tukey
@@ -74,6 +74,7 @@ def multiview(
     gate: float = 3.0,
     max_steps: int = 40,
     rtol: float = 1e-3,
+    backend: AbstractBackend | None = None,
 ) -> MultiView:
     """The poses that minimise the sum of rho(r^2) over the matches of all scans.
 
@@ -92,12 +93,14 @@ def multiview(
       than 45 degrees.
     - `max_steps`, `rtol`: of each level; steps that move no point by more than `rtol`
       voxels end it.
+    - `backend`: how matches are found, `CellList()` by default (see `neighbors.build`).
 
     Poses are constants under differentiation; points moved by them are not. Raises
     `GeometryError` for clouds without normals or a start of another size.
     """
     _check(clouds, start)
     kernel = Tukey() if kernel is None else kernel
+    backend = CellList() if backend is None else backend
     clouds, start = jax.lax.stop_gradient(
         (jax.tree.map(jnp.asarray, clouds), jax.tree.map(jnp.asarray, start))
     )
@@ -112,7 +115,8 @@ def multiview(
             partial(thin, voxel_size=size, capacity=room), clouds
         )
         overflow |= jnp.any(required > room)
-        problem = _Problem(scans, pairs, kernel, gate * size, rtol * size)
+        limits = (gate * size, rtol * size)
+        problem = _Problem(scans, pairs, kernel, backend, *limits)
         poses, count, done = problem.solve(poses, max_steps)
         counts.append(count)
     return problem.conclude(poses, jnp.stack(counts), overflow, done)
@@ -124,14 +128,18 @@ class _Problem(eqx.Module):
     scans: PointCloud
     pairs: Int[Array, "p 2"]
     kernel: AbstractKernel
+    backend: AbstractBackend
     gate: Float[Array, ""]
     atol: Float[Array, ""]
 
+    def build(self):
+        """The search structures of all scans."""
+        one = lambda scan: build(scan.points, scan.mask, backend=self.backend)
+        return jax.lax.map(one, self.scans)
+
     def solve(self, poses, max_steps):
         """Poses, steps, and whether the last step moved nothing."""
-        index = jax.lax.map(
-            lambda scan: build(scan.points, scan.mask, backend=CellList(1)), self.scans
-        )
+        index = self.build()
         center, reach = self.frame(poses)
 
         def step(carry):
@@ -218,9 +226,7 @@ class _Problem(eqx.Module):
 
     def conclude(self, poses, counts, overflow, done) -> MultiView:
         """The result, with new matches at the final poses."""
-        index = jax.lax.map(
-            lambda scan: build(scan.points, scan.mask, backend=CellList(1)), self.scans
-        )
+        index = self.build()
         matches = self.match(index, poses)
         center, reach = self.frame(poses)
         far = jnp.asarray(jnp.inf, self.gate.dtype)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, PyTree
 
 from .._core import GeometryError, message
 from ..transforms import Affine, Rigid, Similarity, procrustes
@@ -18,21 +18,25 @@ _MOST_DAMPING = 1e6
 
 
 class Step(eqx.Module):
-    """A move of the source about the center of the target, and the next damping."""
+    """A move of the source about the center of the target, and what is remembered.
+
+    `stuck` where no move was found although the cost could be much lower.
+    """
 
     transform: Rigid | Similarity | Affine
-    damping: Float[Array, ""]
+    memory: PyTree
+    stuck: Bool[Array, ""]
 
 
 class AbstractSolver(eqx.Module):
     """The choice of a solver for the problem between two searches for pairs."""
 
     @abstractmethod
-    def start(self) -> float:
-        """The damping of the first step."""
+    def start(self, size: int, dtype) -> PyTree:
+        """What the first step remembers, for steps of `size` coordinates."""
 
     @abstractmethod
-    def step(self, problem: Problem, damping: Float[Array, ""]) -> Step:
+    def step(self, problem: Problem, memory: PyTree) -> Step:
         """The move that makes the cost at the given pairs smaller."""
 
     @abstractmethod
@@ -49,15 +53,15 @@ class GaussNewton(AbstractSolver):
 
     damping: float = 1e-6
 
-    def start(self):
-        return self.damping
+    def start(self, size, dtype):
+        return None
 
     def validate(self, objective, model):
         pass
 
-    def step(self, problem, damping):
-        z = _solve(problem, damping)
-        return Step(problem.model.exp(problem.tangent.basis @ z), damping)
+    def step(self, problem, memory):
+        z = _damped(problem.normal_equations(), self.damping)
+        return _step(problem, z, memory)
 
 
 class LevenbergMarquardt(AbstractSolver):
@@ -70,13 +74,13 @@ class LevenbergMarquardt(AbstractSolver):
     least: float = 1e-6
     factor: float = 10.0
 
-    def start(self):
-        return self.least
+    def start(self, size, dtype):
+        return jnp.asarray(self.least, dtype)
 
     def validate(self, objective, model):
         pass
 
-    def step(self, problem, damping):
+    def step(self, problem, memory):
         equations = problem.normal_equations()
 
         def attempt(carry):
@@ -88,11 +92,11 @@ class LevenbergMarquardt(AbstractSolver):
         going = lambda carry: carry[2] & (carry[1] < _MOST_DAMPING)
         zero = jnp.zeros_like(equations.gradient)
         z, damping, worse = jax.lax.while_loop(
-            going, attempt, (zero, damping, jnp.asarray(True))
+            going, attempt, (zero, memory, jnp.asarray(True))
         )
         z = jnp.where(worse, 0, z)
         damping = jnp.maximum(damping / self.factor, self.least)
-        return Step(problem.model.exp(problem.tangent.basis @ z), damping)
+        return _step(problem, z, damping)
 
 
 class Alternation(AbstractSolver):
@@ -101,8 +105,8 @@ class Alternation(AbstractSolver):
     For `PointToPoint` and rigid or similarity models without locked directions.
     """
 
-    def start(self):
-        return 0.0
+    def start(self, size, dtype):
+        return None
 
     def validate(self, objective, model):
         free = model.basis is None and model.prior is None
@@ -117,7 +121,7 @@ class Alternation(AbstractSolver):
                 )
             )
 
-    def step(self, problem, damping):
+    def step(self, problem, memory):
         zero = jnp.zeros(problem.size, problem.points.dtype)
         weights = problem.robust_weights(problem.residuals(zero))
         fit = procrustes(
@@ -126,7 +130,7 @@ class Alternation(AbstractSolver):
             weights,
             scaling=isinstance(problem.model, SimilarityModel),
         )
-        return Step(fit.transform, damping)
+        return Step(fit.transform, memory, jnp.asarray(False))
 
 
 class LeastSquares(AbstractSolver):
@@ -138,13 +142,13 @@ class LeastSquares(AbstractSolver):
     solver: optx.AbstractLeastSquaresSolver
     max_steps: int = 8
 
-    def start(self):
-        return 0.0
+    def start(self, size, dtype):
+        return None
 
     def validate(self, objective, model):
         pass
 
-    def step(self, problem, damping):
+    def step(self, problem, memory):
         zero = jnp.zeros(problem.size, problem.points.dtype)
         found = optx.least_squares(
             lambda z, problem: problem.rescaled(z),
@@ -152,7 +156,7 @@ class LeastSquares(AbstractSolver):
             max_steps=self.max_steps,
             throw=False,
         )
-        return _unless_worse(problem, found.value, damping)
+        return _unless_worse(problem, found.value, memory)
 
 
 class Minimise(AbstractSolver):
@@ -164,13 +168,13 @@ class Minimise(AbstractSolver):
     solver: optx.AbstractMinimiser
     max_steps: int = 32
 
-    def start(self):
-        return 0.0
+    def start(self, size, dtype):
+        return None
 
     def validate(self, objective, model):
         pass
 
-    def step(self, problem, damping):
+    def step(self, problem, memory):
         zero = jnp.zeros(problem.size, problem.points.dtype)
         # The trace of H makes steps of order one out of slopes in any unit.
         unit = jnp.trace(problem.normal_equations().matrix) / problem.size
@@ -181,24 +185,30 @@ class Minimise(AbstractSolver):
             max_steps=self.max_steps,
             throw=False,
         )
-        return _unless_worse(problem, found.value, damping)
+        return _unless_worse(problem, found.value, memory)
 
 
-def _unless_worse(problem, z, damping) -> Step:
-    """A solver cut short may end anywhere: only a move that lowers the cost is made."""
+def _step(problem, z, memory, stuck=False) -> Step:
+    move = problem.model.exp(problem.tangent.basis @ z)
+    return Step(move, memory, jnp.asarray(stuck))
+
+
+def _unless_worse(problem, z, memory) -> Step:
+    """A solver cut short may end anywhere: only a move that lowers the cost is made.
+
+    It is stuck where there is none, but Gauss-Newton would go farther than the rounding
+    of the cost can hide.
+    """
     zero = jnp.zeros_like(z)
     better = problem.energy(z) < problem.energy(zero)
-    z = jnp.where(better, z, zero)
-    return Step(problem.model.exp(problem.tangent.basis @ z), damping)
+    ahead = _damped(problem.normal_equations(), jnp.finfo(z.dtype).eps)
+    far = jnp.max(jnp.abs(ahead)) > 4 * jnp.finfo(z.dtype).eps ** (1 / 2)
+    return _step(problem, jnp.where(better, z, zero), memory, ~better & far)
 
 
 def _slack(z):
     """The relative rounding of a sum over all pairs."""
     return 64 * jnp.finfo(z.dtype).eps
-
-
-def _solve(problem, damping):
-    return _damped(problem.normal_equations(), damping)
 
 
 def _damped(equations, damping):

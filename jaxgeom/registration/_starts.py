@@ -7,7 +7,9 @@ from jaxtyping import Array, Float
 from .._core import RESULTS
 from ..shapes import PointCloud, TriangleMesh
 from ..transforms import Affine, Rigid, Similarity
-from ._icp import Method, PreparedTarget, Registration, icp, prepare_target
+from ._icp import icp
+from ._report import Registration
+from ._scene import Method, PreparedTarget, prepare_target
 
 
 def icp_from_many(

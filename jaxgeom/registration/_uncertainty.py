@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import safe_divide
-from ._icp import Registration
+from ._report import Registration
 
 
 def pose_covariance(found: Registration) -> Float[Array, "dof dof"]:

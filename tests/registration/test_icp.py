@@ -12,13 +12,17 @@ import pytest
 from jaxgeom import Affine, PointCloud, Rigid, Similarity, TriangleMesh
 from jaxgeom._core import RESULTS, GeometryError
 from jaxgeom.meshes import icosphere
+from jaxgeom.neighbors import BruteForce, HostTree
 from jaxgeom.registration import (
+    L2,
     AffineModel,
     Alternation,
+    Anderson,
     ClosestSurface,
     DistanceField,
     Facing,
     GaussianPrior,
+    GaussNewton,
     Generalized,
     LeastSquares,
     LevenbergMarquardt,
@@ -83,9 +87,15 @@ def _pair(dtype=np.float32):
     return _padded(*map(np.asarray, source), dtype), target
 
 
+def _method(**parts):
+    """A method whose search compiles in no time."""
+    return Method(correspondence=Nearest(backend=BruteForce()), **parts)
+
+
 @eqx.filter_jit
 def align(source, target, **settings):
-    return icp(source, target, **{"max_distance": GATE, "max_steps": 40, **settings})
+    usual = {"method": _method(), "max_distance": GATE, "max_steps": 40}
+    return icp(source, target, **(usual | settings))
 
 
 def _off(found, move=MOVE):
@@ -95,21 +105,23 @@ def _off(found, move=MOVE):
 
 SOLVERS = [
     Method(),
-    Method(objective=Symmetric()),
-    Method(objective=Generalized()),
-    Method(solver=LeastSquares(optx.Dogleg(rtol=1e-6, atol=1e-6))),
+    _method(objective=Symmetric()),
+    _method(objective=Generalized()),
+    _method(solver=LeastSquares(optx.Dogleg(rtol=1e-6, atol=1e-6))),
 ]
 # Each composition is a program of its own, and takes seconds to compile.
 MORE_SOLVERS = [
-    Method(solver=LevenbergMarquardt()),
-    Method(objective=PointToPoint(), solver=Alternation()),
-    Method(solver=LeastSquares(optx.GaussNewton(rtol=1e-6, atol=1e-6))),
-    Method(solver=Minimise(optx.BFGS(rtol=1e-6, atol=1e-6))),
+    _method(solver=LevenbergMarquardt()),
+    _method(objective=PointToPoint(), solver=Alternation()),
+    _method(solver=LeastSquares(optx.GaussNewton(rtol=1e-6, atol=1e-6))),
+    _method(solver=Minimise(optx.BFGS(rtol=1e-6, atol=1e-6))),
     Method(correspondence=Mutual()),
     Method(correspondence=Reciprocal(0.05)),
     Method(correspondence=Nearest(Facing(0.8))),
-    Method(kernel=Trimmed(0.8)),
-    Method(model=SimilarityModel()),
+    _method(kernel=Trimmed(0.8)),
+    _method(solver=Anderson(GaussNewton())),
+    Method(correspondence=Nearest(backend=HostTree())),
+    _method(model=SimilarityModel()),
 ]
 SOLVERS += [pytest.param(m, marks=pytest.mark.slow) for m in MORE_SOLVERS]
 
@@ -127,7 +139,7 @@ def test_every_composition_finds_the_motion(method):
 
 def test_affine_maps_are_found():
     source, target = _pair()
-    found = align(source, target, method=Method(model=AffineModel()), max_steps=100)
+    found = align(source, target, method=_method(model=AffineModel()), max_steps=100)
     assert found.result == RESULTS.successful
     assert isinstance(found.target_from_source, Affine) and _off(found) < 4e-3
 
@@ -136,7 +148,7 @@ def test_scale_is_found():
     source, target = _pair()
     shrink = Similarity(jnp.asarray(1.05), jnp.eye(3), jnp.zeros(3))
     small = shrink.inverse()(source)
-    method = Method(objective=PointToPoint(), model=SimilarityModel())
+    method = _method(objective=PointToPoint(), model=SimilarityModel())
     found = align(small, target, method=method, max_steps=100)
     assert abs(float(found.target_from_source.scale) - 1.05) < 3e-3
 
@@ -230,6 +242,71 @@ def test_statuses():
     assert align(source, target).result == RESULTS.successful
 
 
+class _Idle(optx.AbstractMinimiser):
+    """A minimiser that gives up where it starts."""
+
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: object = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        return jnp.zeros((), bool)
+
+    def step(self, fn, y, args, options, state, tags):
+        return y, state, fn(y, args)[1]
+
+    def terminate(self, fn, y, args, options, state, tags):
+        return jnp.asarray(False), optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return y, aux, {}
+
+
+def test_a_solver_without_a_way_down_is_a_status():
+    source, target = _pair()
+    method = _method(solver=Minimise(_Idle()))
+    stuck = align(source, target, method=method, max_steps=4)
+    assert stuck.result == RESULTS.not_converged and stuck.num_steps == 4
+    # At the minimum there is no way down, and nothing to complain of.
+    best = align(source, target).target_from_source
+    there = align(source, target, method=method, init=best)
+    assert there.result == RESULTS.successful
+
+
+def test_mixing_takes_fewer_steps_to_the_same_place(x64):
+    # On a smooth surface the alternation slides slowly, every step a bit shorter.
+    axes = jnp.asarray([1.0, 0.7, 0.5])
+    body = lambda p: jnp.linalg.norm(p / axes) - 1
+    x = np.random.default_rng(9).normal(size=(N, 3))
+    x = x / np.linalg.norm(x, axis=1, keepdims=True) * axes
+    source = PointCloud(Rigid.exp(jnp.asarray(3 * MOVE)).inverse()(x))
+    parts = dict(correspondence=DistanceField(), objective=PointToPoint(), kernel=L2())
+    solve = lambda solver: eqx.filter_jit(icp)(
+        source, body, method=Method(solver=solver, **parts), max_steps=400, rtol=1e-8
+    )
+    plain, mixed = solve(Alternation()), solve(Anderson())
+    assert mixed.result == plain.result == RESULTS.successful
+    assert mixed.num_steps < 0.4 * plain.num_steps
+    assert _off(plain, 3 * MOVE) < 1e-6 and _off(mixed, 3 * MOVE) < 1e-6
+
+
+def test_pairs_that_are_kept_are_those_of_a_new_search():
+    rng = np.random.default_rng(7)
+    source, target = _pair()
+    rule = Nearest()
+    match = jax.jit(lambda moved, last: rule.match(index, moved, 0.3, last))
+    anew = jax.jit(lambda moved: rule.match(index, moved, 0.3))
+    index = rule.prepare(target)
+    found = anew(source)
+    for size in (0.1, 0.03, 0.01, 0.003, 0.001, 0.0003):
+        source = Rigid.exp(jnp.asarray(size * rng.normal(size=6), np.float32))(source)
+        found, true = match(source, found), anew(source)
+        np.testing.assert_array_equal(found.mask, true.mask)
+        np.testing.assert_array_equal(found.indices, true.indices)
+    still = jnp.all(found.memory.points == source.points, axis=1)
+    assert np.mean(still) < 0.2 and np.any(found.mask) and not np.all(found.mask)
+
+
 def test_planes_and_lines_are_degenerate():
     rng = np.random.default_rng(4)
     flat = rng.uniform(-1, 1, (M, 3)) * [1, 1, 0]
@@ -248,22 +325,22 @@ def test_planes_and_lines_are_degenerate():
     )
     line = rng.uniform(-1, 1, (M, 1)) * [1.0, 0.0, 0.0]
     rod = PointCloud(line.astype(np.float32), up.astype(np.float32))
-    points = Method(objective=PointToPoint())
+    points = _method(objective=PointToPoint())
     found = align(_padded(line[:N], up[:N]), rod, method=points)
     assert found.result == RESULTS.degenerate_input
 
 
 def test_locked_directions_and_prior():
     source, target = _pair()
-    shift = align(source, target, method=Method(model=RigidModel(translation_only())))
+    shift = align(source, target, method=_method(model=RigidModel(translation_only())))
     np.testing.assert_allclose(shift.target_from_source.rotation, np.eye(3), atol=1e-6)
     axis = np.array([0.0, 0.0, 1.0])
-    turn = align(source, target, method=Method(model=RigidModel(yaw(axis))))
+    turn = align(source, target, method=_method(model=RigidModel(yaw(axis))))
     np.testing.assert_allclose(turn.target_from_source.rotation @ axis, axis, atol=1e-6)
     assert not np.allclose(turn.target_from_source.rotation, np.eye(3), atol=1e-3)
     mean = Rigid.exp(jnp.asarray([0.0, 0.0, 0.0, 0.02, 0.0, 0.0]))
     strong = GaussianPrior(mean, 1e-8 * jnp.eye(6), 1.0)
-    held = align(source, target, method=Method(model=RigidModel(prior=strong)))
+    held = align(source, target, method=_method(model=RigidModel(prior=strong)))
     np.testing.assert_allclose(
         held.target_from_source.matrix(), mean.matrix(), atol=1e-4
     )
@@ -294,7 +371,7 @@ def test_surfaces_and_fields():
 
 def test_history_falls_and_one_trace_serves_a_bucket():
     source, target = _pair()
-    method = Method(
+    method = _method(
         kernel=Tukey(0.3), objective=PointToPlane(), solver=LevenbergMarquardt()
     )
     found = align(source, target, method=method, history=True)
@@ -317,8 +394,8 @@ def test_clear_errors():
     source, target = _pair()
     bare = PointCloud(source.points, None, source.mask)
     with pytest.raises(GeometryError, match="needs normals of the source"):
-        icp(bare, target, method=Method(objective=Symmetric()))
+        icp(bare, target, method=_method(objective=Symmetric()))
     with pytest.raises(GeometryError, match="Alternation fits points"):
-        icp(source, target, method=Method(solver=Alternation()))
+        icp(source, target, method=_method(solver=Alternation()))
     with pytest.raises(GeometryError, match="needs a TriangleMesh"):
         icp(source, target, method=Method(correspondence=ClosestSurface()))

@@ -7,10 +7,12 @@ import pytest
 from scipy.stats import chi2
 
 from jaxgeom import PointCloud, Rigid
+from jaxgeom.neighbors import BruteForce
 from jaxgeom.registration import (
     L2,
     FixedWidth,
     Method,
+    Nearest,
     PointToPlane,
     Symmetric,
     Tukey,
@@ -22,6 +24,7 @@ from jaxgeom.registration import (
 )
 
 N, M, STEP = 60, 200, 1e-5
+PAIRS = Nearest(backend=BruteForce())
 
 
 def _scene(seed):
@@ -41,7 +44,9 @@ def _scene(seed):
 
 def _pose(objective, solve, *parts):
     source, normals, target, target_normals, weights, width = parts
-    method = Method(objective=objective, kernel=Tukey(FixedWidth(width)))
+    method = Method(
+        correspondence=PAIRS, objective=objective, kernel=Tukey(FixedWidth(width))
+    )
     clouds = PointCloud(source, normals), PointCloud(target, target_normals)
     return solve(*clouds, method=method, weights=weights, max_distance=0.3)
 
@@ -99,7 +104,7 @@ def test_padding_has_no_gradient(x64):
     mask = jnp.arange(N) < N - 7
 
     def loss(source):
-        method = Method(kernel=Welsch(FixedWidth(width)))
+        method = Method(correspondence=PAIRS, kernel=Welsch(FixedWidth(width)))
         clouds = PointCloud(source, normals, mask), PointCloud(target, target_normals)
         return _number(icp(*clouds, method=method, max_distance=0.3))
 
@@ -116,7 +121,7 @@ def test_covariance_is_that_of_many_draws(kernel, x64):
     def draw(key):
         noisy = clean + sigma * jax.random.normal(key, clean.shape)
         clouds = PointCloud(noisy), PointCloud(target, target_normals)
-        found = icp(*clouds, method=Method(kernel=kernel))
+        found = icp(*clouds, method=Method(correspondence=PAIRS, kernel=kernel))
         xi = (found.target_from_source @ truth.inverse()).log()
         return xi, (pose_covariance(found), sandwich_covariance(found))
 

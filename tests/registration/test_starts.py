@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from jaxgeom import RESULTS, GeometryError, PointCloud, Rigid, stack
-from jaxgeom.registration import Method, PointToPoint, icp_from_many
+from jaxgeom.neighbors import BruteForce
+from jaxgeom.registration import Method, Nearest, PointToPoint, icp_from_many
 from jaxgeom.shapes import subsample
 
-METHOD = Method(objective=PointToPoint())
+# A search that compiles in no time.
+PAIRS = Nearest(backend=BruteForce())
+METHOD = Method(correspondence=PAIRS, objective=PointToPoint())
 
 
 def _letter(count=300, seed=0):
