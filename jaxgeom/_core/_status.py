@@ -13,6 +13,7 @@ class RESULTS(optx.RESULTS):
     zero_normals = "Some normals are zero or not finite: these points were ignored."
     outside_grid = "Some points lie outside the grid: these points were ignored."
     no_surface = "The level set does not meet the grid: there is no surface."
+    steep_field = "The field is steeper than its Lipschitz constant: surface is lost."
     no_consensus = "Too few pairs of points agree on one transform."
     no_overlap = "No source point has a target point within the allowed distance."
     too_few_matches = "Fewer pairs of points than the alignment needs."

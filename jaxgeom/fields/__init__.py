@@ -53,6 +53,8 @@ from ._meshes import Occupancy as Occupancy
 from ._meshes import SoftOccupancy as SoftOccupancy
 from ._metaballs import Metaballs as Metaballs
 from ._metaballs import PointCloudField as PointCloudField
+from ._narrow_band import NarrowBand as NarrowBand
+from ._narrow_band import narrow_band as narrow_band
 from ._offsets import Offset as Offset
 from ._offsets import Rounded as Rounded
 from ._offsets import Shell as Shell

@@ -3,6 +3,8 @@
 from ._ambiguity import AbstractFaceRule as AbstractFaceRule
 from ._ambiguity import AsymptoticDecider as AsymptoticDecider
 from ._ambiguity import SeparateInside as SeparateInside
+from ._brick_cubes import count_on_bricks as count_on_bricks
+from ._brick_cubes import marching_cubes_on_bricks as marching_cubes_on_bricks
 from ._classify import Counts as Counts
 from ._dual_contouring import DualContouring as DualContouring
 from ._dual_contouring import dual_contouring as dual_contouring

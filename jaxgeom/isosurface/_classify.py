@@ -57,7 +57,7 @@ def classify(
     inside, finite = stage(token, _join_halves, halves)
     bits = stage(token, lambda i, f: _bits(i, f, nz), inside, finite)
     corners = stage(token, corner_words, bits.inside)
-    num_faces = stage(token, _num_faces, corners, bits.cells)
+    num_faces = stage(token, count_faces, corners, bits.cells)
     decided = rule.joined(values, level, token)
     if decided is not None:
         joined = stage(token, _on_ambiguous, decided, corners, bits.inside)
@@ -142,7 +142,7 @@ def _number(bits: Bits, num_faces) -> Numbers:
     return Numbers(first_vertex, vertices, prefix_sum(cells), cells, needed)
 
 
-def _num_faces(corners, active):
+def count_faces(corners, active):
     """The number of triangles of all cells, 32 cells at a time.
 
     A loop of k edges has k - 2 triangles. A cell whose inside corners span V corners,

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._core import runtime_token
+from .._core import GeometryError, message, runtime_token
+from ..fields import NarrowBand
 from ..shapes import Grid
+from ._brick_extract import extract_band
 from ._extraction import Capacity, Extraction
 from ._marching_cubes import MarchingCubes
 
@@ -17,8 +19,8 @@ _MARCHING_CUBES = MarchingCubes()
 
 
 def extract(
-    field: Float[Array, "x y z"] | Callable,
-    grid: Grid,
+    field: Float[Array, "x y z"] | Callable | NarrowBand,
+    grid: Grid | None = None,
     level: Float[Array, ""] | float = 0.0,
     *,
     method=_MARCHING_CUBES,
@@ -31,9 +33,11 @@ def extract(
 
     **Arguments:**
 
-    - `field`: [x, y, z] samples at the nodes of `grid`, or a function of one point [3].
+    - `field`: [x, y, z] samples at the nodes of `grid`, or a function of one point [3],
+      or a `NarrowBand`, which has its own grid and level: work and memory then grow
+      with the area of the surface.
     - `method`: the settings of an extractor. It is given the samples and, where
-      `field` is a function, the function as `field=`.
+      `field` is a function, the function as `field=`. A band takes `MarchingCubes`.
     - `closed`: surround the grid by a layer of outside nodes, so that a surface that
       leaves the grid is closed half a cell beyond its sides.
 
@@ -42,6 +46,9 @@ def extract(
         ball = extract(lambda p: jnp.linalg.norm(p) - 0.7, grid).mesh
     """
     token = runtime_token()
+    if isinstance(field, NarrowBand):
+        _check_band(grid, method, closed)
+        return extract_band(field, method, token)
     function = field if callable(field) else None
     values = jnp.asarray(field) if function is None else _sample(field, grid)
     # A Python number would be a constant of the program: one compilation per level.
@@ -76,6 +83,17 @@ def pad_outside(
             where = (*inner[:axis], end, *inner[axis + 1 :])
             padded = padded.at[where].set(level + depth)
     return padded, Grid(grid.origin - grid.spacing, grid.spacing, shape)
+
+
+def _check_band(grid, method, closed):
+    if grid is not None or closed or not isinstance(method, MarchingCubes):
+        raise GeometryError(
+            message(
+                "a narrow band is extracted by MarchingCubes, on its own grid",
+                f"grid={grid}, method={method}, closed={closed}",
+                "Give grid, level and `closed` to `NarrowBand.around`.",
+            )
+        )
 
 
 @eqx.filter_jit

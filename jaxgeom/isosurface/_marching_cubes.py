@@ -33,7 +33,7 @@ from ._vertices import Samples, directions, find_edges, positions
 
 # A sample on the level would put all vertices around it on one spot, and give faces
 # without area: vertices keep this distance from the nodes, in cells.
-_CLEARANCE = 1e-3
+CLEARANCE = 1e-3
 
 _LINEAR = Linear()
 _SEPARATE = SeparateInside()
@@ -154,7 +154,7 @@ def as_float(values, level):
 
 def _parameter(placement, values, edges, level):
     t = placement(Samples(values, edges), level)
-    return jnp.clip(t, _CLEARANCE, 1 - _CLEARANCE)
+    return jnp.clip(t, CLEARANCE, 1 - CLEARANCE)
 
 
 def check_grid(values, grid):
