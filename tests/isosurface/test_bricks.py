@@ -56,7 +56,9 @@ def assert_same(mesh, other, grid):
 
 
 @pytest.mark.parametrize("kind", ["noise", "ties"])
-@pytest.mark.parametrize("ambiguity", [None, AsymptoticDecider()])
+@pytest.mark.parametrize(
+    "ambiguity", [pytest.param(None, marks=pytest.mark.slow), AsymptoticDecider()]
+)
 def test_white_noise_and_ties_give_the_dense_mesh(kind, ambiguity):
     rng = np.random.default_rng(0)
     noise = (

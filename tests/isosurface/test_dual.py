@@ -18,6 +18,8 @@ from jaxgeom.shapes import Grid
 
 SHAPE = (9, 7, 11)
 METHODS = [DualContouring(), DualMarchingCubes()]
+# Topology is the same code for both: one of them will do by default.
+SHARED = [pytest.param(DualContouring(), marks=pytest.mark.slow), DualMarchingCubes()]
 # Each capacity compiles its own program: one of three is left to the slow run.
 SHORT = [0, 1, pytest.param(2, marks=pytest.mark.slow)]
 
@@ -51,7 +53,7 @@ def blocks(cells):
     return values.astype(np.float32)
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", SHARED, ids=lambda m: type(m).__name__)
 def test_closed_after_padding(tools, method):
     grid = tools.grid_of(SHAPE)
     for values in (noise(0), noise(1), ties(0), ties(1), ties(2), sheets()):
@@ -62,7 +64,7 @@ def test_closed_after_padding(tools, method):
             assert int(out.required_faces) == out.mesh.faces.shape[0]
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", SHARED, ids=lambda m: type(m).__name__)
 def test_all_sign_patterns(tools, method):
     """The 4096 of 3x2x2 nodes hold the 256 of 2x2x2: those with a side outside."""
     values = blocks((3, 2, 2))
@@ -120,7 +122,7 @@ def test_overflow_is_told_and_leaves_valid_faces(tools, method, short):
     np.testing.assert_allclose(kept[named], known[named], atol=1e-5)
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", SHARED, ids=lambda m: type(m).__name__)
 def test_vmap_is_the_loop(tools, method):
     grid, capacity = tools.grid_of(SHAPE), Capacity(900, 2600)
     one = lambda values: method(values, grid, capacity=capacity)

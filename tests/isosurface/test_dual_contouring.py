@@ -91,7 +91,7 @@ def test_corners_and_edges_of_turned_boxes(tools):
 @pytest.mark.parametrize(
     "body, sizes",
     [
-        (Torus(0.55, 0.25), (16, 31)),
+        pytest.param(Torus(0.55, 0.25), (16, 31), marks=pytest.mark.slow),
         pytest.param(Torus(0.55, 0.25), (31, 61), marks=pytest.mark.slow),
         pytest.param(Sphere(0.7), (16, 31, 61), marks=pytest.mark.slow),
     ],

@@ -47,7 +47,10 @@ def radius_error(n, placement):
     return np.abs(radii - 0.7).max()
 
 
-@pytest.mark.parametrize("placement, order", [(Linear(), 2), (Cubic(), 4)])
+@pytest.mark.parametrize(
+    "placement, order",
+    [(Linear(), 2), pytest.param(Cubic(), 4, marks=pytest.mark.slow)],
+)
 def test_order_of_convergence(x64, placement, order):
     sizes = (16, 31, 61)
     errors = [radius_error(n, placement) for n in sizes]
