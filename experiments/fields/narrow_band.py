@@ -71,7 +71,8 @@ def main():
     run = band if arguments.form == "band" else dense
     method = MarchingCubes(normals=arguments.normals)
     print(
-        f"{arguments.field} {arguments.resolution}^3 {arguments.form}, start {_peak():.2f} GiB"
+        f"{arguments.field} {arguments.resolution}^3 {arguments.form}, "
+        f"start {_peak():.2f} GiB"
     )
     for _ in range(arguments.repeat):
         out, seconds = run(FIELDS[arguments.field], arguments.resolution, method)

@@ -123,7 +123,7 @@ def test_covariance_is_that_of_many_draws(kernel, x64):
     def draw(key):
         noisy = clean + sigma * jax.random.normal(key, clean.shape)
         clouds = PointCloud(noisy), PointCloud(target, target_normals)
-        found = icp(*clouds, method=Method(correspondence=PAIRS, kernel=kernel))
+        found = icp(*clouds, method=Method(kernel=kernel))
         xi = (found.target_from_source @ truth.inverse()).log()
         return xi, (pose_covariance(found), sandwich_covariance(found))
 

@@ -7,7 +7,6 @@ import pytest
 
 import jaxgeom as jg
 from jaxgeom import RESULTS, Rigid
-from jaxgeom.neighbors import BruteForce
 from jaxgeom.registration import (
     GlobalStart,
     ViewGraph,
@@ -79,8 +78,7 @@ def _errors(found, truth):
     return np.asarray(angle), np.linalg.norm(np.asarray(here) - CENTER, axis=1)
 
 
-# A search that compiles in no time.
-SETTINGS = dict(voxel_size=0.06, backend=BruteForce())
+SETTINGS = dict(voxel_size=0.06)
 _solve = jax.jit(
     lambda clouds, start: multiview(
         clouds, start, voxel_size=0.06, backend=BruteForce()
