@@ -18,6 +18,11 @@ from ._claims import Claims as Claims
 from ._claims import Exactness as Exactness
 from ._claims import Trust as Trust
 from ._conditioned import Conditioned as Conditioned
+from ._curvature import Curvatures as Curvatures
+from ._curvature import curvatures as curvatures
+from ._curvature import gradient as gradient
+from ._curvature import hessian as hessian
+from ._curvature import inside as inside
 from ._deformations import Bent as Bent
 from ._deformations import Displaced as Displaced
 from ._deformations import Elongated as Elongated
