@@ -50,6 +50,8 @@ from ._gallery import heart as heart
 from ._gallery import kummer_quartic as kummer_quartic
 from ._gallery import steiner_roman as steiner_roman
 from ._gallery import tanglecube as tanglecube
+from ._integrals import area as area
+from ._integrals import volume as volume
 from ._lsystem import Branches as Branches
 from ._lsystem import LSystem as LSystem
 from ._lsystem import demo_bush as demo_bush
@@ -94,6 +96,8 @@ from ._queries import normal as normal
 from ._queries import project as project
 from ._queries import sample as sample
 from ._queries import value as value
+from ._redistance import Redistanced as Redistanced
+from ._redistance import redistance as redistance
 from ._repeats import Mirrored as Mirrored
 from ._repeats import PolarRepeated as PolarRepeated
 from ._repeats import Repeated as Repeated
