@@ -18,6 +18,11 @@ from ._claims import Claims as Claims
 from ._claims import Exactness as Exactness
 from ._claims import Trust as Trust
 from ._conditioned import Conditioned as Conditioned
+from ._curvature import Curvatures as Curvatures
+from ._curvature import curvatures as curvatures
+from ._curvature import gradient as gradient
+from ._curvature import hessian as hessian
+from ._curvature import inside as inside
 from ._deformations import Bent as Bent
 from ._deformations import Displaced as Displaced
 from ._deformations import Elongated as Elongated
@@ -45,6 +50,8 @@ from ._gallery import heart as heart
 from ._gallery import kummer_quartic as kummer_quartic
 from ._gallery import steiner_roman as steiner_roman
 from ._gallery import tanglecube as tanglecube
+from ._integrals import area as area
+from ._integrals import volume as volume
 from ._lsystem import Branches as Branches
 from ._lsystem import LSystem as LSystem
 from ._lsystem import demo_bush as demo_bush
@@ -91,6 +98,8 @@ from ._queries import normal as normal
 from ._queries import project as project
 from ._queries import sample as sample
 from ._queries import value as value
+from ._redistance import Redistanced as Redistanced
+from ._redistance import redistance as redistance
 from ._repeats import Mirrored as Mirrored
 from ._repeats import PolarRepeated as PolarRepeated
 from ._repeats import Repeated as Repeated

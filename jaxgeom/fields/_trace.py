@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._core import safe_normalize
+from ._claims import strong
+from ._field import claims
 from ._frozen import frozen
 from ._queries import normal
 
@@ -35,17 +37,20 @@ def sphere_trace(
     max_steps: int = 256,
     max_distance,
     rtol: float | None = None,
+    lipschitz=None,
 ) -> Hit:
     """The first hit of the ray origin + t direction, 0 <= t <= max_distance (ONE ray).
 
-    Steps by the field's value (Hart 1996), which never passes the surface of a field
-    with Lipschitz constant 1: a distance or a lower bound. A ray that starts inside
-    hits at t = 0; one that grazes may use up `max_steps` and then misses.
+    Steps by f / L (Hart 1996), which never passes the surface of a field with the
+    Lipschitz constant L: |f(x) - f(y)| <= L |x - y|. A ray that starts inside hits at
+    t = 0; one that grazes may use up `max_steps` and then misses.
 
     **Arguments:**
 
     - `direction`: any length but zero; distances are in the unit of the points.
-    - `rtol`: met when field < rtol * max_distance; 32 rounding errors by default.
+    - `rtol`: met when f / L <= rtol * max_distance; 32 rounding errors by default.
+    - `lipschitz`: L > 0, in units of f per length; by default what the field claims,
+      and 1 where it claims none (see `fields.lipschitz`).
 
     Differentiable with respect to field, origin and direction: dt = -df / (grad f . d).
     """
@@ -54,12 +59,26 @@ def sphere_trace(
     far = jnp.asarray(max_distance, dtype)
     near = far * jnp.asarray(32 * jnp.finfo(dtype).eps if rtol is None else rtol, dtype)
     ray = jax.lax.stop_gradient((origin, direction))
-    t, f, steps = _march(frozen(field), ray, near, far, max_steps)
+    steep = jax.lax.stop_gradient(slowness(field, lipschitz)).astype(dtype)
+    still = frozen(field)
+    slowed = lambda x: still(x) / steep
+    t, f, steps = _march(slowed, ray, near, far, max_steps)
     hit = (f <= near) & (t <= far)
     t = jnp.where(hit, t + _sensitivity(field, origin, direction, t, hit), far)
     point = origin + t * direction
     unit = jnp.where(hit, normal(field, point), 0)
     return Hit(point, t, unit, hit, steps)
+
+
+def slowness(field: Callable, lipschitz=None) -> Float[Array, ""]:
+    """By what to divide the values of a field, so that they are safe steps.
+
+    The given constant; or that which the field claims; or 1 where none is known.
+    """
+    if lipschitz is not None:
+        return strong(lipschitz)
+    constant = claims(field).lipschitz
+    return jnp.where(jnp.isfinite(constant) & (constant > 0), constant, 1)
 
 
 def _march(field, ray, near, far, max_steps):

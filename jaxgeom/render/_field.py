@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..fields import Camera, normal
-from ._shading import CLAY, Seen, shade
+from ..fields import Camera, lipschitz, normal
+from ._lighting import AmbientOcclusion, SoftShadows
+from ._shading import CLAY, Seen, key_light, shade
 
 _CHUNK = 16384
 _BURST = 8
@@ -22,16 +23,20 @@ def render_field(
     color=CLAY,
     samples: int = 2,
     max_steps: int = 192,
+    shadows: SoftShadows | None = None,
+    occlusion: AmbientOcclusion | None = None,
 ) -> np.ndarray:
     """The picture uint8 [h, w, 3] of a field (host).
 
-    The field must be a distance or a lower bound, as for `fields.sphere_trace`.
+    Steps are f / L, with the Lipschitz constant L that the field claims, or 1 where it
+    claims none: then it must be a distance or a lower bound.
 
     **Arguments:**
 
     - `size`: (height, width) in pixels.
     - `color`: (red, green, blue) in [0, 1].
     - `samples`: rays along each side of a pixel, averaged.
+    - `shadows`, `occlusion`: how light is kept off; None, and nothing is.
 
     A ray ends at three times the distance from camera to target.
     """
@@ -40,15 +45,47 @@ def render_field(
     far = 3 * float(np.linalg.norm(np.asarray(camera.target - camera.position)))
     # A twentieth of a pixel at the target is nearer than the eye can tell.
     near = far / 60 / float(camera.focal(fine[0]))
-    t, hit = _march(field, camera, directions, near, far, max_steps)
+    steep = lipschitz(field)
+    known = jnp.isfinite(steep) & (steep > 0)
+    slowed = _Slowed(field, jnp.where(known, steep, 1.0))
+    t, hit = _march(slowed, camera, directions, near, far, max_steps)
     normals = np.zeros_like(directions)
     position = np.asarray(camera.position)
-    normals[hit] = _in_chunks(
-        lambda x: _normals(field, x), position + t[hit, None] * directions[hit]
+    points = position + t[hit, None] * directions[hit]
+    normals[hit] = _in_chunks(lambda x: _normals(field, x), points)
+    lamp = key_light(np.asarray(camera.axes(), np.float32))
+    lights = np.ones((len(hit), 2), np.float32)
+    lights[hit] = _in_chunks(
+        lambda x, n: _lights(slowed, (shadows, occlusion), lamp, far / 3, x, n),
+        points,
+        normals[hit],
     )
+    lit, sky = np.moveaxis(lights.reshape(*fine, 2, 1), 2, 0)
     planes = [x.reshape(*fine, 3) for x in (normals, directions)]
     colors = np.broadcast_to(np.float32(color), planes[0].shape)
-    return shade(Seen(hit.reshape(fine), *planes, colors), camera, samples)
+    return shade(Seen(hit.reshape(fine), *planes, colors, lit, sky), camera, samples)
+
+
+class _Slowed(eqx.Module):
+    """f / L."""
+
+    field: Callable
+    constant: jax.Array
+
+    def __call__(self, point):
+        return self.field(point) / self.constant.astype(point.dtype)
+
+
+@eqx.filter_jit
+def _lights(field, settings, lamp, reach, points, normals):
+    """The parts [n, 2] of the key light and of the sky that arrive."""
+    shadows, occlusion = settings
+    one = jnp.ones(len(points), points.dtype)
+    shaded = lambda x, n: shadows.light(field, x + n * reach / 512, lamp, reach)
+    hidden = lambda x, n: occlusion.light(field, x, n)
+    lit = one if shadows is None else jax.vmap(shaded)(points, normals)
+    sky = one if occlusion is None else jax.vmap(hidden)(points, normals)
+    return jnp.stack([lit, sky], axis=1)
 
 
 def _march(field, camera, directions, near, far, max_steps):

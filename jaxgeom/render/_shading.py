@@ -16,13 +16,16 @@ class Seen(NamedTuple):
     """What the pixels [h, w] of a picture see, at `samples` pixels per output pixel.
 
     `hit` [h, w]; unit normals [h, w, 3], directions of the rays [h, w, 3] and colors
-    [h, w, 3] in [0, 1], which mean nothing where `hit` is False.
+    [h, w, 3] in [0, 1], which mean nothing where `hit` is False. `lit` and `open`
+    [h, w, 1] are the parts of the key light and of the sky that arrive.
     """
 
     hit: np.ndarray
     normals: np.ndarray
     directions: np.ndarray
     colors: np.ndarray
+    lit: np.ndarray | float = 1.0
+    open: np.ndarray | float = 1.0
 
 
 def shade(seen: Seen, camera: Camera, samples: int) -> np.ndarray:
@@ -38,7 +41,7 @@ def _radiance(seen, axes, up):
     facing = np.sum(seen.normals * seen.directions, axis=-1, keepdims=True)
     normals = np.where(facing > 0, -seen.normals, seen.normals)
     eye = np.clip(np.abs(facing), 0, 1)
-    key = _unit(-0.55 * right + 0.75 * above - 0.75 * forward)
+    key = key_light(axes)
     fill = _unit(0.9 * right + 0.15 * above - 0.5 * forward)
     lambert = np.clip(normals @ key, 0, None)[..., None]
     filled = np.clip(normals @ fill, 0, None)[..., None]
@@ -47,9 +50,19 @@ def _radiance(seen, axes, up):
     shine = np.clip(-np.sum(halfway * seen.directions, axis=-1, keepdims=True), 0, 1)
     albedo = np.asarray(seen.colors, np.float32) ** _GAMMA
     warm, cool = np.float32([1.0, 0.96, 0.90]), np.float32([0.80, 0.90, 1.0])
-    diffuse = 1.05 * lambert * warm + 0.22 * filled * cool
-    sky = (0.04 + 0.16 * ambient) * cool
-    return albedo * (diffuse + sky) + 0.07 * shine**24 + 0.22 * (1 - eye) ** 3 * cool
+    diffuse = 1.05 * seen.lit * lambert * warm + 0.22 * filled * cool
+    sky = seen.open * (0.04 + 0.16 * ambient) * cool
+    return (
+        albedo * (diffuse + sky)
+        + 0.07 * seen.lit * shine**24
+        + 0.22 * (1 - eye) ** 3 * cool
+    )
+
+
+def key_light(axes) -> np.ndarray:
+    """The direction to the key light, given the axes of a camera."""
+    right, above, forward = axes
+    return _unit(-0.55 * right + 0.75 * above - 0.75 * forward)
 
 
 def _up(camera):
