@@ -13,22 +13,16 @@ import time
 import jax
 import jax.numpy as jnp
 
-from jaxgeom.fields import NarrowBand, Sphere
+from jaxgeom.fields import NarrowBand, Sphere, gyroid
 from jaxgeom.isosurface import MarchingCubes, extract
 from jaxgeom.meshes import topology
 from jaxgeom.shapes import Grid
 
-_TURNS = 25.0
-
-
-def _gyroid(p):
-    """A gyroid of four periods within a ball; slope at most sqrt(3) * _TURNS."""
-    s, c = jnp.sin(_TURNS * p), jnp.cos(_TURNS * p)
-    wave = s[0] * c[1] + s[1] * c[2] + s[2] * c[0]
-    return jnp.maximum(wave / (3**0.5 * _TURNS), jnp.linalg.norm(p) - 0.47)
-
-
-FIELDS = {"sphere": Sphere(0.4, (0.011, -0.007, 0.013)), "gyroid": _gyroid}
+FIELDS = {
+    "sphere": Sphere(0.4, (0.011, -0.007, 0.013)),
+    # Four periods within a ball.
+    "gyroid": gyroid(0.25) & Sphere(0.47),
+}
 
 
 def grid_of(n):
@@ -39,7 +33,7 @@ def grid_of(n):
 def band(field, n, method):
     """The mesh of the band, and the seconds of its two halves."""
     start = time.perf_counter()
-    found = NarrowBand.around(field, grid_of(n), lipschitz=1.0)
+    found = NarrowBand.around(field, grid_of(n))
     middle = time.perf_counter()
     out = extract(found, method=method)
     print(f"  {int(found.num_bricks)} bricks of {(-(-n // 8)) ** 3}")
@@ -70,10 +64,8 @@ def main():
     arguments = parser.parse_args()
     run = band if arguments.form == "band" else dense
     method = MarchingCubes(normals=arguments.normals)
-    print(
-        f"{arguments.field} {arguments.resolution}^3 {arguments.form}, "
-        f"start {_peak():.2f} GiB"
-    )
+    case = f"{arguments.field} {arguments.resolution}^3 {arguments.form}"
+    print(f"{case}, start {_peak():.2f} GiB")
     for _ in range(arguments.repeat):
         out, seconds = run(FIELDS[arguments.field], arguments.resolution, method)
         parts = " + ".join(f"{s:.2f}" for s in seconds)

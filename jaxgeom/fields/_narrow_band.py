@@ -85,6 +85,10 @@ class NarrowBand(eqx.Module):
         - `closed`: surround the grid by a layer of outside nodes, so that a surface
           that leaves the grid is closed half a cell beyond its sides.
 
+            ball = Sphere(0.4)
+            grid = Grid(jnp.full(3, -0.5), jnp.full(3, 1 / 1023), (1024, 1024, 1024))
+            mesh = extract(NarrowBand.around(ball, grid)).mesh
+
         Raises `GeometryError` for more than 8192 nodes along an axis, or where
         `lipschitz` is not given and the field claims no finite constant.
         """

@@ -1,12 +1,14 @@
 """Marching cubes on bricks is marching cubes on the dense grid."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxgeom._core import RESULTS, GeometryError
-from jaxgeom.fields import NarrowBand, Sphere, narrow_band
+from jaxgeom.fields import NarrowBand, Sphere, declare, gyroid, narrow_band
 from jaxgeom.isosurface import (
     AsymptoticDecider,
     Capacity,
@@ -83,6 +85,18 @@ def test_a_ball_is_the_dense_one_closed_and_needs_few_bricks(tools):
     assert_same(out.mesh, extract(BALL, BOX).mesh, BOX)
 
 
+@pytest.mark.parametrize("field", [BALL, gyroid(0.7)], ids=["ball", "gyroid"])
+def test_at_64_cubed_the_mesh_is_the_dense_one_and_closed(field, tools):
+    spacing = np.float32([0.021, 0.019, 0.017])
+    grid = Grid(np.float32([-0.7, -0.8, -0.6]), spacing, (64, 64, 64))
+    method = MarchingCubes(normals=False)
+    out = extract(NarrowBand.around(field, grid, closed=True), method=method)
+    assert out.result == RESULTS.successful
+    tools.assert_closed(out.mesh)
+    dense = extract(field, grid, method=method, closed=True)
+    assert_same(out.mesh, dense.mesh, grid)
+
+
 def test_the_compiled_form_reports_its_need():
     size = int(NarrowBand.around(BALL, BOX).num_bricks)
     run = lambda n: narrow_band(BALL, BOX, capacity=n)
@@ -102,12 +116,64 @@ def test_overflow_keeps_faces_that_name_existing_vertices():
 
 
 def test_a_steep_field_is_reported():
-    wrong = NarrowBand.around(lambda p: 3.0 * BALL(p), BOX, lipschitz=0.2)
-    assert extract(wrong).result != RESULTS.successful
+    right, wrong = (NarrowBand.around(BALL, BOX, lipschitz=x) for x in (1.0, 0.8))
+    assert 0 < wrong.num_bricks < right.num_bricks
+    assert extract(right).result == RESULTS.successful
+    assert extract(wrong).result == RESULTS.steep_field
+
+
+def test_no_surface_and_values_that_are_no_numbers_are_reported():
+    far = NarrowBand.around(BALL, BOX, 5.0)
+    assert far.result == RESULTS.no_surface and far.num_bricks == 0
+    assert extract(far).result == RESULTS.no_surface
+    band = NarrowBand.around(BALL, BOX)
+    hole = dataclasses.replace(band, values=band.values.at[3, 4, 4, 4].set(jnp.nan))
+    assert extract(hole).result == RESULTS.nonfinite_input
+
+
+def test_the_derivative_reaches_the_vertices_under_jit():
+    center, radius = np.array([0.1, -0.05, 0.02]), 0.71
+
+    def vertices(radius):
+        band = narrow_band(Sphere(radius, jnp.float32(center)), BOX, capacity=256)
+        out = marching_cubes_on_bricks(
+            band, capacity=Capacity(8000, 16000), normals=False
+        )
+        return out.mesh.vertices, (out.mesh.num_vertices, out.result)
+
+    run = jax.jit(lambda r: jax.jvp(vertices, (r,), (1.0,), has_aux=True))
+    points, speed, (count, result) = run(radius)
+    assert result == RESULTS.successful and not np.any(speed[count:])
+    points, speed = np.float64(points)[:count], np.float64(speed)[:count]
+    places = (points - BOX.origin) / BOX.spacing
+    rows, axis = np.arange(count), np.argmax(np.abs(places - np.round(places)), axis=1)
+    low = np.round(places)
+    low[rows, axis] = np.floor(places[rows, axis])
+    high = low + np.eye(3)[axis]
+    before, after = (
+        np.linalg.norm(BOX.origin + BOX.spacing * x - center, axis=1) - radius
+        for x in (low, high)
+    )
+    # t = f / (f - g) has the derivative 1 / (g - f); clamped vertices stay.
+    t = before / (before - after)
+    free = (t > 0.002) & (t < 0.998)
+    wanted = np.eye(3)[axis] * (BOX.spacing[axis] / (after - before))[:, None]
+    np.testing.assert_allclose(speed[free], wanted[free], rtol=0.01)
+    assert free.mean() > 0.98
 
 
 def test_a_field_that_does_not_tell_is_an_error():
+    plain = lambda p: p[0]
     with pytest.raises(GeometryError, match="Lipschitz"):
-        NarrowBand.around(lambda p: p[0], BOX)
+        NarrowBand.around(plain, BOX)
+    with pytest.raises(GeometryError, match="Lipschitz"):
+        NarrowBand.around(declare(plain, lipschitz=np.inf), BOX)
+    with pytest.raises(GeometryError, match="Lipschitz"):
+        narrow_band(plain, BOX, capacity=8)
+    with pytest.raises(GeometryError, match="capacity"):
+        narrow_band(BALL, BOX, capacity=0)
+    huge = Grid(BOX.origin, BOX.spacing, (8193, 5, 5))
+    with pytest.raises(GeometryError, match="8192"):
+        NarrowBand.around(BALL, huge)
     with pytest.raises(GeometryError, match="own grid"):
         extract(NarrowBand.around(BALL, BOX), BOX)
