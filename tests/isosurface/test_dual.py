@@ -83,7 +83,7 @@ def test_vertices_lie_in_their_cells(tools, method):
     assert steps.max() == 1 and (steps.sum(-1) <= 2).all()
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", SHARED, ids=lambda m: type(m).__name__)
 def test_open_only_along_the_sides_of_the_grid(tools, method):
     grid = tools.grid_of(SHAPE)
     mesh = extract(noise(3), grid, method=method).mesh
@@ -98,7 +98,7 @@ def test_open_only_along_the_sides_of_the_grid(tools, method):
     assert lonely.any() and at_side.all(0).any(-1).all()
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", SHARED, ids=lambda m: type(m).__name__)
 @pytest.mark.parametrize("short", SHORT)
 def test_overflow_is_told_and_leaves_valid_faces(tools, method, short):
     values, grid = noise(10), tools.grid_of(SHAPE)

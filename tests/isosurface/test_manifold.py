@@ -83,7 +83,9 @@ def test_open_only_at_the_sides_of_the_grid(tools):
     assert lonely.any() and at_side.all(0).any(-1).all()
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "shape", [SHAPES[0], *(pytest.param(s, marks=pytest.mark.slow) for s in SHAPES[1:])]
+)
 def test_count_is_exact(tools, shape):
     values = jnp.asarray(noise(shape, 1))
     needed = count(values, 0.2)

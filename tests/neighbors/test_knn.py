@@ -65,7 +65,7 @@ def test_equals_a_tree(name, backend):
     _assert_exact(points, queries, 5, find(points, queries))
 
 
-@pytest.mark.parametrize("k", [1, 64])
+@pytest.mark.parametrize("k", [1, pytest.param(64, marks=pytest.mark.slow)])
 def test_other_counts_of_neighbors(k):
     points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS["surface"])
     _assert_exact(

@@ -30,7 +30,13 @@ def _closed(out):
 
 
 @pytest.mark.parametrize(
-    "scale, shift", [(1.0, 0.0), (1e-6, 0.0), (1e6, 3.0), (2.0, 4e6)]
+    "scale, shift",
+    [
+        pytest.param(1.0, 0.0, marks=pytest.mark.slow),
+        (1e-6, 0.0),
+        pytest.param(1e6, 3.0, marks=pytest.mark.slow),
+        (2.0, 4e6),
+    ],
 )
 def test_units_and_places_do_not_matter(scale, shift):
     points, normals = _bumpy(3000)

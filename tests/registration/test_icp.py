@@ -106,11 +106,11 @@ def _off(found, move=MOVE):
 SOLVERS = [
     Method(),
     _method(objective=Symmetric()),
-    _method(objective=Generalized()),
-    _method(solver=LeastSquares(optx.Dogleg(rtol=1e-6, atol=1e-6))),
 ]
 # Each composition is a program of its own, and takes seconds to compile.
 MORE_SOLVERS = [
+    _method(objective=Generalized()),
+    _method(solver=LeastSquares(optx.Dogleg(rtol=1e-6, atol=1e-6))),
     _method(solver=LevenbergMarquardt()),
     _method(objective=PointToPoint(), solver=Alternation()),
     _method(solver=LeastSquares(optx.GaussNewton(rtol=1e-6, atol=1e-6))),

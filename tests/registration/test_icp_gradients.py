@@ -58,7 +58,11 @@ def _number(found):
     return jnp.sum(table * pose.rotation) + pose.translation @ table[1]
 
 
-@pytest.mark.parametrize("objective", [PointToPlane(), Symmetric()], ids=str)
+@pytest.mark.parametrize(
+    "objective",
+    [PointToPlane(), pytest.param(Symmetric(), marks=pytest.mark.slow)],
+    ids=str,
+)
 def test_implicit_derivative_is_that_of_the_answer(objective, x64):
     parts = _scene(0)
     loss = jax.jit(lambda parts: _number(_pose(objective, icp, *parts)))

@@ -78,12 +78,7 @@ def _errors(found, truth):
     return np.asarray(angle), np.linalg.norm(np.asarray(here) - CENTER, axis=1)
 
 
-SETTINGS = dict(voxel_size=0.06)
-_solve = jax.jit(
-    lambda clouds, start: multiview(
-        clouds, start, voxel_size=0.06, backend=BruteForce()
-    )
-)
+_solve = jax.jit(lambda clouds, start: multiview(clouds, start, voxel_size=0.06))
 
 
 def test_joint_poses_are_exact_for_one_surface(views):
@@ -124,9 +119,7 @@ def test_a_scan_far_from_all_others_is_a_status(views):
 def test_too_little_room_is_a_status(views):
     clouds, truth = views
     out = jax.jit(
-        lambda c, t: multiview(
-            c, t, voxel_size=0.06, backend=BruteForce(), capacity=200, levels=(1.0,)
-        )
+        lambda c, t: multiview(c, t, voxel_size=0.06, capacity=200, levels=(1.0,))
     )(clouds, truth)
     assert out.result == RESULTS.capacity_exceeded
 
@@ -136,9 +129,9 @@ def test_clouds_without_normals_are_an_error(views):
     bare = jg.PointCloud(clouds.points[0], None)
     bare = jax.tree.map(lambda x: np.stack([x] * 4), bare)
     with pytest.raises(jg.GeometryError, match="needs oriented normals"):
-        multiview(bare, truth, voxel_size=0.06, backend=BruteForce())
+        multiview(bare, truth, voxel_size=0.06)
     with pytest.raises(jg.GeometryError, match="start.translation"):
-        multiview(clouds, _turns(3, 0, 0.1), voxel_size=0.06, backend=BruteForce())
+        multiview(clouds, _turns(3, 0, 0.1), voxel_size=0.06)
 
 
 def _graph(edges, poses):
