@@ -1,7 +1,7 @@
 """How near the extractors come to sharp shapes, and to smooth ones (CPU).
 
     python experiments/isosurface/sharp.py --resolution 64
-    python experiments/isosurface/sharp.py --picture /tmp/sharp.png
+    python experiments/isosurface/sharp.py --picture sharp.png
 
 Bodies with edges, turned at random, on a grid of three different spacings. Prints in
 cells (the widest spacing): the distance of points on the edges of the body from the
@@ -33,7 +33,6 @@ METHODS = {
     "marching cubes, cubic": MarchingCubes(placement=Cubic()),
     "dual marching cubes": DualMarchingCubes(),
     "dual contouring": DualContouring(),
-    "dual contouring, cuts=0": DualContouring(cuts=0),
 }
 HALF = np.array([0.5, 0.42, 0.56], np.float32)
 

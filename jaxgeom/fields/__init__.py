@@ -145,7 +145,6 @@ from ._smooth import QuadraticFillet as QuadraticFillet
 from ._smooth import QuarticFillet as QuarticFillet
 from ._smooth import RootFillet as RootFillet
 from ._smooth import SigmoidFillet as SigmoidFillet
-from ._smooth import SmoothDifference as SmoothDifference
 from ._smooth import SmoothIntersection as SmoothIntersection
 from ._smooth import SmoothUnion as SmoothUnion
 from ._smooth import UnionOfMany as UnionOfMany

@@ -36,14 +36,6 @@ def _spread(x):
     return (x | x << 2) & 0x9249249
 
 
-class Boxes(eqx.Module):
-    """Boxes of `size` cells a side, the first `count` of them real; box i of an axis
-    begins at node size * i."""
-
-    index: Int[Array, "b 3"]
-    count: Int[Array, ""]
-
-
 class Sampler(eqx.Module):
     """A field less its level at the nodes of a grid, and a bound of its slope.
 

@@ -118,7 +118,8 @@ class AbstractField(eqx.Module):
 
     def smooth_sub(self, other: Callable, width) -> "AbstractField":
         """The difference with its edge rounded off over `width`."""
-        return _room().SmoothDifference(self, other, width)
+        room = _room()
+        return room.SmoothIntersection(self, room.Complement(other), width)
 
     def rounded(self, radius) -> "AbstractField":
         """The body grown by radius >= 0, its edges rounded; stays exact outside."""

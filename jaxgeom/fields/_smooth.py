@@ -134,25 +134,6 @@ class SmoothIntersection(AbstractField):
         return joined.filled(self.width / 6).complement()
 
 
-class SmoothDifference(AbstractField):
-    """-smin(-a, b): the difference with its edge rounded off; a lower bound.
-
-    Between the difference and k = width / 6 above it.
-    """
-
-    first: Callable
-    second: Callable
-    width: Float[Array, ""] = eqx.field(converter=scalar)
-    fillet: AbstractFillet = CubicFillet()
-
-    def evaluate(self, point):
-        return -_smooth_min(self, -self.first(point), self.second(point))
-
-    def claims(self):
-        a, b = claims_of_all(self.first, self.second)
-        return a.complement().union(b).filled(self.width / 6).complement()
-
-
 class UnionOfMany(AbstractField):
     """The union of any number of fields; with a width, its creases are filled.
 

@@ -14,6 +14,8 @@ the surface passes the edge where the field does, which keeps creases and ridges
 both do that as well, by the better shape.
 """
 
+from abc import abstractmethod
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
@@ -25,7 +27,7 @@ from ._ambiguity import SeparateInside
 from ._bits import WORD, below, popcount
 from ._classify import Bits, Counts, Numbers, classify
 from ._extraction import Capacity, Extraction
-from ._marching_cubes import finish
+from ._marching_cubes import as_float, finish
 from ._patch_tables import patch_tables
 from ._patches import (
     PatchCells,
@@ -45,6 +47,20 @@ _NARROW = 0.02
 _SAME_FIT = 1e-3
 # Differences of the smaller triangle, relative to the quad, that do not count.
 _SAME_SHAPE = 1e-3
+
+
+class AbstractDualMethod(eqx.Module):
+    """Settings of an extractor with a vertex per patch and two faces per cut edge."""
+
+    @abstractmethod
+    def __call__(
+        self, values, grid, level=0.0, *, capacity, field=None, token=None
+    ) -> Extraction:
+        """The level set of sampled values, and of the `field` behind them if given."""
+
+    def measure(self, values, level=0.0, *, token=None) -> Counts:
+        """The sizes that the extraction needs, without making it."""
+        return count_dual(*as_float(values, level), token)
 
 
 class Dual(eqx.Module):

@@ -3,10 +3,8 @@
 Classify and compact as marching cubes does. Hermite data: every cut edge gets its
 crossing and its normal (`_hermite.py`). Place: a patch gets the point of its cell that
 fits the tangent planes of its crossings best (`_qef.py`), on a flat patch their mean,
-on an edge or a corner of the body the edge or the corner. A corner whose edges of the
-cell miss one of its planes is found by cutting planes (Kelley 1960): where the field is
-not zero at the vertex, its tangent plane there is the one that was missed. Emit: a quad
-per cut edge, split where the surface is (`_dual.py`).
+on an edge or a corner of the body the edge or the corner. Emit: a quad per cut edge,
+split where the surface is (`_dual.py`).
 
 Ju, Losasso, Schaefer and Warren (2002); one vertex per patch and the flipped faces:
 Nielson (2004), Schaefer, Ju and Warren (2007).
@@ -14,16 +12,12 @@ Nielson (2004), Schaefer, Ju and Warren (2007).
 
 from collections.abc import Callable
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._core import safe_divide, safe_norm, safe_normalize, stage
+from .._core import safe_normalize, stage
 from ..shapes import Grid
-from ._classify import Counts
-from ._dual import Dual, count_dual, dual_mesh, find_dual
+from ._dual import AbstractDualMethod, Dual, dual_mesh, find_dual
 from ._extraction import Capacity, Extraction
 from ._hermite import CLEARANCE, Hermite, from_field, from_samples
 from ._marching_cubes import as_float, check_grid
@@ -31,19 +25,16 @@ from ._patches import Patches, corner_indices
 from ._qef import Planes, minimize_all
 
 _STEPS = 4
-_PROJECTIONS = 2
 
 
-class DualContouring(eqx.Module):
+class DualContouring(AbstractDualMethod):
     """Settings of dual contouring.
 
     - `regularization`: the weight of the mean crossing against the tangent planes, in
       units of the mean squared cosine between their normals (see `dual_contouring`).
-    - `cuts`: static; tangent planes of the field added at the vertex, one by one.
     """
 
     regularization: float = 1e-2
-    cuts: int = eqx.field(static=True, default=3)
 
     def __call__(
         self, values, grid, level=0.0, *, capacity, field=None, token=None
@@ -56,13 +47,8 @@ class DualContouring(eqx.Module):
             capacity=capacity,
             field=field,
             regularization=self.regularization,
-            cuts=self.cuts,
             token=token,
         )
-
-    def measure(self, values, level=0.0, *, token=None) -> Counts:
-        """The sizes that the extraction needs, without making it."""
-        return count_dual(*as_float(values, level), token)
 
 
 def dual_contouring(
@@ -73,7 +59,6 @@ def dual_contouring(
     capacity: Capacity,
     field: Callable | None = None,
     regularization: Float[Array, ""] | float = 1e-2,
-    cuts: int = 3,
     token: Bool[Array, ""] | None = None,
 ) -> Extraction:
     """The surface where a field equals `level`, with its edges and corners, as a mesh
@@ -98,8 +83,6 @@ def dual_contouring(
       through the samples and central differences, which round them off.
     - `regularization`: w of `_qef.py`, relative to unit normals. Larger keeps
       vertices nearer to the mean crossing, on surfaces with noise.
-    - `cuts`: static; how often the tangent plane of `field` at the vertex itself is
-      added to those of the crossings.
     - `token`: a run-time true that keeps stages apart on CPUs (see `stage`), or None.
 
     **Statuses:** `capacity_exceeded`, `nonfinite_input`, `no_surface`.
@@ -112,14 +95,8 @@ def dual_contouring(
     dual = find_dual(values, level, capacity, token)
     hermite = hermite_data(field, values, dual, grid, level, token)
     weight = jnp.asarray(regularization, values.dtype)
-    tangents = None if field is None else _tangents(field, level)
-    vertices, normals = stage(
-        token,
-        lambda h, d, w: place_vertices(h, d, grid, w, tangents, cuts),
-        hermite,
-        dual,
-        weight,
-    )
+    place = lambda h, d, w: place_vertices(h, d, grid, w)
+    vertices, normals = stage(token, place, hermite, dual, weight)
     return dual_mesh(dual, vertices, normals, hermite.t, grid, capacity, token)
 
 
@@ -130,19 +107,23 @@ def hermite_data(field, values, dual: Dual, grid, level, token) -> Hermite:
     return from_field(field, values, dual.edges, dual.inside, grid, level)
 
 
-class _Fit(eqx.Module):
-    """The sums of the normal equations of all patches, in units of the widest side of
-    a cell from its corner, and the points that fit them."""
+def place_vertices(hermite: Hermite, dual: Dual, grid: Grid, weight):
+    """The vertex and the mean normal of every patch."""
+    patches = dual.patches
+    # Cells are fitted from their corner, in units of their widest side.
+    scale = jnp.max(grid.spacing)
+    size = grid.spacing / scale
+    planes = _planes(hermite, patches, size)
+    low, high = CLEARANCE * size, (1 - CLEARANCE) * size
+    local = minimize_all(planes, low, high, weight, _STEPS)
+    corner = grid.origin + grid.spacing * corner_indices(patches.node, grid.shape)
+    held = patches.held[..., None].astype(corner.dtype)
+    normals = jnp.sum(held * hermite.normals[patches.edge], axis=0)
+    return corner + scale * local, safe_normalize(normals)
 
-    mean: Float[Array, "v 3"]
-    normal: Float[Array, "v 3 3"]
-    right: Float[Array, "v 3"]
-    number: Float[Array, " v"]
-    point: Float[Array, "v 3"]
 
-
-def _fit_crossings(hermite: Hermite, patches: Patches, size, weight) -> _Fit:
-    """The tangent planes of the crossings of every patch."""
+def _planes(hermite: Hermite, patches: Patches, size) -> Planes:
+    """The tangent planes at the crossings of every patch, about their mean."""
     points = local_crossings(hermite.t, patches) * size
     normals = hermite.normals[patches.edge]
     held = patches.held[..., None].astype(points.dtype)
@@ -150,85 +131,9 @@ def _fit_crossings(hermite: Hermite, patches: Patches, size, weight) -> _Fit:
     mean = jnp.sum(held * points, axis=0) / number
     offsets = jnp.sum(normals * (points - mean), axis=-1, keepdims=True)
     outer = normals[..., :, None] * normals[..., None, :]
-    normal = jnp.sum(held[..., None] * outer, axis=0)
-    right = jnp.sum(held * normals * offsets, axis=0)
-    return _solved(_Fit(mean, normal, right, number[:, 0], mean), size, weight)
-
-
-def _solved(fit: _Fit, size, weight) -> _Fit:
-    number = fit.number[:, None]
-    planes = Planes(fit.mean, fit.normal / number[..., None], fit.right / number)
-    low, high = CLEARANCE * size, (1 - CLEARANCE) * size
-    point = minimize_all(planes, low, high, weight, _STEPS)
-    return eqx.tree_at(lambda f: f.point, fit, point)
-
-
-def _cut_again(fit: _Fit, tangent, sound, size, weight, steps) -> _Fit:
-    """The fit with the tangent planes of the field at its own points, `steps` times."""
-
-    def step(fit, _):
-        miss, normals = tangent(fit.point)
-        used = sound & jnp.isfinite(miss) & (jnp.abs(miss) < 1)
-        normals = jnp.where(used[:, None], normals, 0.0)
-        miss = jnp.where(used, miss, 0.0)
-        offset = jnp.sum(normals * (fit.point - fit.mean), axis=-1) - miss
-        normal = fit.normal + normals[:, :, None] * normals[:, None, :]
-        right = fit.right + normals * offset[:, None]
-        cut = _Fit(fit.mean, normal, right, fit.number + used, fit.point)
-        return _solved(cut, size, weight), None
-
-    fit = lax.scan(step, fit, None, length=steps)[0]
-    return eqx.tree_at(
-        lambda f: f.point, fit, _projected(fit.point, tangent, sound, size)
-    )
-
-
-def _projected(points, tangent, sound, size):
-    """Points moved onto the surface, in their cells: planes that meet outside of the
-    cell leave them between the surface and the meeting point."""
-
-    def step(points, _):
-        miss, normals = tangent(points)
-        used = sound & jnp.isfinite(miss) & (jnp.abs(miss) < 1)
-        move = jnp.where(used[:, None], miss[:, None] * normals, 0.0)
-        return jnp.clip(points - move, CLEARANCE * size, (1 - CLEARANCE) * size), None
-
-    return lax.scan(step, points, None, length=_PROJECTIONS)[0]
-
-
-def place_vertices(hermite: Hermite, dual: Dual, grid: Grid, weight, tangents, cuts):
-    """The vertex and the mean normal of every patch.
-
-    `tangents`: the distance of points to the surface and the normal there, to first
-    order; or None, and no `cuts` are made.
-    """
-    patches = dual.patches
-    scale = jnp.max(grid.spacing)
-    size = grid.spacing / scale
-    corner = grid.origin + grid.spacing * corner_indices(patches.node, grid.shape)
-    fit = _fit_crossings(hermite, patches, size, weight)
-    if tangents is not None:
-        sound = jnp.all(hermite.sound[patches.edge] | ~patches.held, axis=0)
-
-        def tangent(local):
-            miss, normals = tangents(corner + scale * local)
-            return miss / scale, normals
-
-        fit = _cut_again(fit, tangent, sound, size, weight, cuts)
-    held = patches.held[..., None].astype(corner.dtype)
-    normals = jnp.sum(held * hermite.normals[patches.edge], axis=0)
-    return corner + scale * fit.point, safe_normalize(normals)
-
-
-def _tangents(field, level):
-    """The signed distance of points to the surface, and its normal, to first order."""
-
-    def at(points):
-        values, slopes = jax.vmap(jax.value_and_grad(field))(points)
-        steep = safe_norm(slopes)
-        return safe_divide(values - level, steep), safe_normalize(slopes)
-
-    return at
+    normal = jnp.sum(held[..., None] * outer, axis=0) / number[..., None]
+    right = jnp.sum(held * normals * offsets, axis=0) / number
+    return Planes(mean, normal, right)
 
 
 def local_crossings(t: Float[Array, " e"], patches: Patches) -> Float[Array, "k v 3"]:

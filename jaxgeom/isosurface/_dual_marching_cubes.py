@@ -8,14 +8,12 @@ The crossings are off the surface by O(h^2), and so is their mean.
 Nielson (2004); the faces that are flipped to keep it manifold: `_patch_tables.py`.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._core import safe_normalize, stage
 from ..shapes import Grid
-from ._classify import Counts
-from ._dual import Dual, count_dual, dual_mesh, find_dual
+from ._dual import AbstractDualMethod, Dual, dual_mesh, find_dual
 from ._dual_contouring import local_crossings
 from ._extraction import Capacity, Extraction
 from ._hermite import CLEARANCE, Hermite
@@ -27,7 +25,7 @@ from ._vertices import Samples, directions
 _LINEAR = Linear()
 
 
-class DualMarchingCubes(eqx.Module):
+class DualMarchingCubes(AbstractDualMethod):
     """Settings of dual marching cubes in Nielson's sense.
 
     - `placement`: where crossings lie on their edges, `Linear()` or `Cubic()`.
@@ -48,10 +46,6 @@ class DualMarchingCubes(eqx.Module):
             placement=self.placement,
             token=token,
         )
-
-    def measure(self, values, level=0.0, *, token=None) -> Counts:
-        """The sizes that the extraction needs, without making it."""
-        return count_dual(*as_float(values, level), token)
 
 
 def dual_marching_cubes(
@@ -94,7 +88,7 @@ def dual_marching_cubes(
     held = lambda s, v: jnp.clip(placement(s, v), CLEARANCE, 1 - CLEARANCE)
     t = stage(token, held, samples, level)
     normals = directions(t, samples, grid, token)
-    hermite = Hermite(t, normals, jnp.ones_like(t, bool))
+    hermite = Hermite(t, normals)
     vertices, normals = stage(token, lambda h, d: _means(h, d, grid), hermite, dual)
     return dual_mesh(dual, vertices, normals, t, grid, capacity, token)
 

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._core import safe_divide, safe_normalize, stage
 from ..shapes import Grid
@@ -28,19 +28,17 @@ _STEPS = 12
 
 
 class Hermite(eqx.Module):
-    """Crossings of cut edges: the parameter in [0, 1], the unit normal, and whether
-    both are the field's (or the samples', where there is no field)."""
+    """Crossings of cut edges: the parameter in [0, 1] and the unit normal."""
 
     t: Float[Array, " e"]
     normals: Float[Array, "e 3"]
-    sound: Bool[Array, " e"]
 
 
 def from_samples(values, edges: CutEdges, grid: Grid, level, token) -> Hermite:
     """Hermite data of sampled values."""
     samples = Samples(values, edges)
     t = stage(token, lambda s, v: _held(Linear()(s, v)), samples, level)
-    return Hermite(t, directions(t, samples, grid, token), jnp.ones_like(t, bool))
+    return Hermite(t, directions(t, samples, grid, token))
 
 
 def from_field(
@@ -65,7 +63,7 @@ def from_field(
     growing = jnp.where(inside, 1.0, -1.0).astype(root.dtype)
     axis = jax.nn.one_hot(edges.axis, 3, dtype=root.dtype) * growing[:, None]
     gradient = jnp.where(sound[:, None], gradient, axis)
-    return Hermite(root, safe_normalize(gradient), sound)
+    return Hermite(root, safe_normalize(gradient))
 
 
 def _root(along, start, stop, changes, line):

@@ -274,7 +274,7 @@ def _check_target(target, kind, name):
 
 def _nearest(prepared, moved, max_distance, last) -> Found:
     """The nearest points; only those points are searched that the last search leaves
-    in doubt (after L. Greenspan, G. Godin, A nearest neighbor method for efficient ICP,
+    in doubt (after M. Greenspan, G. Godin, A nearest neighbor method for efficient ICP,
     2001)."""
     # Beyond the gate, so that points without a pair need not be searched at once.
     reach = _BEYOND * max_distance

@@ -167,7 +167,6 @@ def test_regularization_keeps_vertices_near_their_mean():
             capacity=Capacity(1200, 2400),
             field=body,
             regularization=weight,
-            cuts=0,
         )
         miss = jnp.abs(jax.vmap(body)(out.mesh.vertices))
         return jnp.sum(jnp.where(out.mesh.vertex_mask, miss, 0.0))
