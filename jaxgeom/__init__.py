@@ -16,6 +16,7 @@ _ROOMS = (
     "meshes",
     "neighbors",
     "normals",
+    "parametric",
     "pipelines",
     "reconstruction",
     "registration",
