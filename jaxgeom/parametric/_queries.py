@@ -63,8 +63,8 @@ def second_form(surface: Callable, uv: Float[Array, " 2"]) -> Float[Array, "2 2"
 
     Many texts give it the other sign. Here a sphere of radius r has h = metric / r.
     """
-    hessian = jax.jacfwd(jax.jacfwd(surface))(floating(uv))
-    return -jnp.tensordot(normal(surface, uv), hessian, 1)
+    _, hessian = _two_orders(surface, floating(uv))
+    return -jnp.tensordot(hessian, normal(surface, uv), 1)
 
 
 def area_element(surface: Callable, uv: Float[Array, " 2"]) -> Float[Array, ""]:
@@ -77,23 +77,19 @@ def curvatures(surface: Callable, uv: Float[Array, " 2"]) -> Curvatures:
 
     The second form in an orthonormal basis of the tangent plane: mean = tr / 2,
     Gaussian = det, principal = eigenvalues. At a declared pole they are taken the cube
-    root of the machine epsilon (of the length of the domain) inside, which is right to
-    its square on a surface smooth there. Zero where X_u and X_v are parallel.
-    At umbilics (k1 = k2) the derivative of `principal` is that of the mean.
+    root of the machine epsilon (of the length of the domain) inside: right to its
+    square for closed formulas smooth there, to the root itself for a NURBS net. Zero
+    where X_u and X_v are parallel. At umbilics (k1 = k2) the derivative of `principal` is that of the mean.
     """
-    uv = _off_poles(surface, floating(uv))
-    metric, h = first_form(surface, uv), second_form(surface, uv)
-    (e, f), (_, g) = metric
-    # Rows of an orthonormal basis: X_u / sqrt E, and X_v made perpendicular.
-    area = area_element(surface, uv)
-    long = safe_norm(tangents(surface, uv)[0])
-    to_basis = jnp.stack(
-        [
-            jnp.stack([safe_divide(1, long), jnp.zeros_like(long)]),
-            jnp.stack([-safe_divide(f, long * area), safe_divide(long, area)]),
-        ]
-    )
-    (a, b), (_, c) = to_basis @ h @ to_basis.T
+    rows, hessian = _two_orders(surface, _off_poles(surface, floating(uv)))
+    across = jnp.cross(*rows)
+    h = -jnp.tensordot(hessian, safe_normalize(across), 1)
+    # An orthonormal basis of the tangent plane: X_u / |X_u|, then X_v without X_u.
+    long, patch = safe_norm(rows[0]), safe_norm(across)
+    skew = -safe_divide(jnp.dot(*rows), long * patch)
+    first = jnp.stack([safe_divide(1, long), jnp.zeros_like(long)])
+    basis = jnp.stack([first, jnp.stack([skew, safe_divide(long, patch)])])
+    (a, b), (_, c) = basis @ h @ basis.T
     mean, spread = (a + c) / 2, safe_norm(jnp.stack([(a - c) / 2, b]))
     return Curvatures(mean, a * c - b * b, jnp.stack([mean + spread, mean - spread]))
 
@@ -117,6 +113,13 @@ def enclosed_volume(
     """
     cone = lambda x: jnp.dot(surface(x), jnp.cross(*tangents(surface, x))) / 3
     return _integral(surface, cone, cells, order)
+
+
+def _two_orders(surface, uv):
+    """The first derivatives [2, 3] and the second ones [2, 2, 3], in one pass."""
+    first = lambda x: (lambda j: (j, j))(jax.jacfwd(surface)(x).T)
+    hessian, rows = jax.jacfwd(first, has_aux=True)(uv)
+    return rows, jnp.moveaxis(hessian, 1, 2)
 
 
 def _integral(surface, density, cells, order):
