@@ -79,7 +79,8 @@ def curvatures(surface: Callable, uv: Float[Array, " 2"]) -> Curvatures:
     Gaussian = det, principal = eigenvalues. At a declared pole they are taken the cube
     root of the machine epsilon (of the length of the domain) inside: right to its
     square for closed formulas smooth there, to the root itself for a NURBS net. Zero
-    where X_u and X_v are parallel. At umbilics (k1 = k2) the derivative of `principal` is that of the mean.
+    where X_u and X_v are parallel. At umbilics (k1 = k2) the derivative of `principal`
+    is that of the mean.
     """
     rows, hessian = _two_orders(surface, _off_poles(surface, floating(uv)))
     across = jnp.cross(*rows)
