@@ -15,6 +15,9 @@ _LEAST = 1e-12
 FIRST_DAMPING = 1e-3
 _MOST = 1e12
 _FACTOR = 10.0
+# The least relative curvature for a step of its own length.
+_FLAT = 1e-3
+_ROUNDING = 1024
 
 
 class _State(eqx.Module):
@@ -25,15 +28,16 @@ class _State(eqx.Module):
 class BoxNewton(optx.AbstractLeastSquaresSolver):
     """Damped Newton steps on 1/2 |r(y)|^2 for y [d], d = 1 or 2, within bounds.
 
-    The full Hessian J^T J + sum r_k d^2 r_k where it is positive, J^T J elsewhere, plus
-    damping diag(J^T J). A coordinate at its bound whose slope points outwards is held
-    (Bertsekas 1982); a step that raises the sum is not taken and the damping grows.
-    The end is a step with |J dy| <= atol + rtol |r|, after which a Newton step would
-    be right to the square of that; `closest_point` makes it.
+    By the full Hessian J^T J + sum r_k d^2 r_k, with the sizes of its eigenvalues (in
+    units of J^T J) plus a damping, so that every step goes downhill. A coordinate at
+    its bound whose slope points outwards is held (Bertsekas 1982); a step that raises
+    the sum is not taken and the damping grows. The end is a step with
+    |J dy| <= atol + rtol |r|, after which a Newton step would be right to the square of
+    that; `closest_point` makes it.
 
     `options` of `optimistix.least_squares`: `lower`, `upper` [d] (infinite where there
-    is no bound), `wrap`, a function that brings y back into its domain, and `rounding`,
-    the error of |r|.
+    is no bound), `wrap`, a function that brings y back into its domain, `rounding`, the
+    error of |r|, and `still` [d], the least |dr / dy| that counts.
     """
 
     rtol: float
@@ -62,7 +66,8 @@ def descent(residual: Callable, y, damping, options):
     y stays where it is if |r| would grow by more than `options["rounding"]`.
     """
     local = model(residual, y)
-    change = -_damped(local, is_free(local.jacobian, local.slope, y, options), damping)
+    free = is_free(local.jacobian, local.slope, y, options)
+    change = _damped_step(local, free, damping)
     there = options["wrap"](y + change)
     before, after = safe_norm(local.residual), safe_norm(residual(there))
     better = after <= before + options["rounding"]
@@ -99,31 +104,42 @@ def is_free(jacobian, slope, y, options) -> Bool[Array, " d"]:
     """True for coordinates that may move: not pressed to a bound, and not without
     effect, as the angle at a pole."""
     held = (y <= options["lower"]) & (slope > 0) | (y >= options["upper"]) & (slope < 0)
-    return ~held & (jnp.sum(jacobian**2, axis=0) > 0)
+    return ~held & (safe_norm(jacobian, axis=0) > options["still"])
 
 
-def newton_step(hessian, slope, free) -> Float[Array, " d"]:
-    """-H^-1 slope in the free coordinates (d = 1 or 2); zero where H is singular."""
+def newton_step(local: Model, slope, free) -> Float[Array, " d"]:
+    """-H^-1 slope in the free coordinates; zero in directions in which H is flat."""
+
+    def inverse(bends):
+        flat = _ROUNDING * jnp.finfo(slope.dtype).eps * jnp.max(jnp.abs(bends))
+        steep = jnp.abs(bends) > flat
+        return jnp.where(steep, 1 / jnp.where(steep, bends, 1), 0)
+
+    return -_applied(local, slope, free, inverse)
+
+
+def _damped_step(local, free, damping):
+    """Downhill also where the energy is not convex: by the sizes of the bends."""
+    inverse = lambda bends: 1 / (jnp.maximum(jnp.abs(bends), _FLAT) + damping)
+    return -_applied(local, local.slope, free, inverse)
+
+
+def _applied(local, slope, free, inverse):
+    """f(H) slope, in coordinates in which all columns of J have length one."""
+    scale = jnp.where(free, safe_norm(local.jacobian, axis=0), 1)
     both = free[:, None] & free[None, :]
-    h = jnp.where(both, hessian, jnp.eye(len(slope), dtype=slope.dtype))
-    g = jnp.where(free, slope, 0)
-    if len(slope) == 1:
-        return -safe_divide(g, h[0])
-    adjugate = jnp.array([[1, -1], [-1, 1]], g.dtype) * h[::-1, ::-1].T
-    return -safe_divide(adjugate @ g, _determinant(h))
+    eye = jnp.eye(len(scale), dtype=scale.dtype)
+    scaled = jnp.where(both, local.hessian / (scale[:, None] * scale), eye)
+    return _spectral(scaled, inverse) @ (jnp.where(free, slope, 0) / scale) / scale
 
 
-def _damped(local, free, damping):
-    gauss = local.jacobian.T @ local.jacobian
-    lift = damping * jnp.diag(jnp.diagonal(gauss))
-    both = free[:, None] & free[None, :]
-    held = jnp.where(both, local.hessian, jnp.eye(len(free), dtype=gauss.dtype))
-    eps = jnp.finfo(gauss.dtype).eps
-    least = 16 * eps * jnp.prod(jnp.where(free, jnp.diagonal(gauss), 1))
-    positive = (_determinant(held) > least) & jnp.all(jnp.diagonal(held) > 0)
-    hessian = jnp.where(positive, local.hessian, gauss)
-    return -newton_step(hessian + lift, local.slope, free)
-
-
-def _determinant(h):
-    return h[0, 0] if len(h) == 1 else h[0, 0] * h[1, 1] - h[0, 1] * h[1, 0]
+def _spectral(h, f):
+    """f of the eigenvalues of a symmetric matrix of size 1 or 2, as p 1 + q h."""
+    if len(h) == 1:
+        return f(h[0])[None]
+    mean, half = (h[0, 0] + h[1, 1]) / 2, (h[0, 0] - h[1, 1]) / 2
+    spread = safe_norm(jnp.stack([half, h[0, 1]]))
+    bends = jnp.stack([mean + spread, mean - spread])
+    high, low = f(bends)
+    q = safe_divide(high - low, 2 * spread)
+    return (high - q * bends[0]) * jnp.eye(2, dtype=h.dtype) + q * h

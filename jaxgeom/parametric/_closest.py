@@ -57,7 +57,9 @@ def closest_point(
       `not_converged`.
 
     **Statuses:** `not_converged` after `max_steps`, or where the slope of the distance
-    along the shape is more than rounding.
+    along the shape is more than rounding. So also at a corner or a crease inside the
+    domain (a vertex of a polyline, a knot repeated as often as the degree): the point
+    is found, but the difference is not normal there.
 
     Once differentiable in the query and in the parameters of the shape: `distance` by
     the envelope theorem, `parameters` and `point` by the implicit function theorem.
@@ -133,11 +135,16 @@ def _descend(search, query, y, solver, max_steps):
         solver,
         y,
         args=(search, query, unit),
-        options={**options, "rounding": options["rounding"] / unit},
+        options=_in_unit(options, unit),
         max_steps=max_steps,
         throw=False,
     )
     return found.value
+
+
+def _in_unit(options, unit):
+    scaled = {k: options[k] / unit for k in ("rounding", "still")}
+    return {**options, **scaled}
 
 
 def _located(search: Callable, frozen, query, best) -> ParametricPoint:
@@ -146,14 +153,14 @@ def _located(search: Callable, frozen, query, best) -> ParametricPoint:
     options = frozen.options(held, best)
     local = model(lambda x: frozen(x) - held, best)
     free = is_free(local.jacobian, local.slope, best, options)
-    step = newton_step(local.hessian, local.slope, free)
+    step = newton_step(local, local.slope, free)
     there = frozen.wrap(best + step)
     # The step is left out where it does harm: at a fold, or far from the solution.
     before, after = safe_norm(local.residual), safe_norm(frozen(there) - held)
     y = jnp.where(after <= before + options["rounding"], there, best)
     result = _status(frozen, held, y, options)
     slope = jax.jacfwd(search)(best).T @ (search(best) - query)
-    step = newton_step(local.hessian, slope, free)
+    step = newton_step(local, slope, free)
     y = y + step - jax.lax.stop_gradient(step)
     point = search(y)
     y = y[0] if len(search.intervals) == 1 else y

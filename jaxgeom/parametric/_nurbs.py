@@ -147,14 +147,15 @@ class NurbsSurface(AbstractSurface):
         rows, columns = (
             basis.derivatives(t, order) for basis, t in zip(self.bases, uv, strict=True)
         )
-        across = jnp.tensordot(rows, self.homogeneous(), 1)
-        table = jnp.einsum("lm,kmd->kld", columns, across)
+        net = self.homogeneous()
+        # One product after the other: batches of small matrices are slow on a CPU.
+        across = [jnp.tensordot(row, net, 1) for row in rows]
+        table = [[column @ part for column in columns] for part in across]
         out = [[None] * (order + 1) for _ in range(order + 1)]
         for k in range(order + 1):
             for m in range(order + 1):
-                out[k][m] = (table[k, m, :-1] - _rest(table, out, k, m)) / table[
-                    0, 0, -1
-                ]
+                rest = _rest(table, out, k, m)
+                out[k][m] = (table[k][m][:-1] - rest) / table[0][0][-1]
         return jnp.stack([jnp.stack(row) for row in out])
 
 
@@ -162,7 +163,7 @@ def _rest(table, out, k, m):
     """What the derivatives of the weight take from the derivative [k, m]."""
     below = [(i, j) for i in range(k + 1) for j in range(m + 1) if i or j]
     return sum(
-        comb(k, i) * comb(m, j) * table[i, j, -1] * out[k - i][m - j] for i, j in below
+        comb(k, i) * comb(m, j) * table[i][j][-1] * out[k - i][m - j] for i, j in below
     )
 
 

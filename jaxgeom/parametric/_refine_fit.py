@@ -28,11 +28,11 @@ def refine_fit(
     Minimises the energy of `fit_curve` over the control points, where each parameter is
     that of the nearest point of the moving curve or surface: `corrections` Newton steps
     from the given parameters, whose derivative enters the Jacobian (variable
-    projection), so that points may slide along the shape. Weights of control points
-    stay; open clamped ends are free.
+    projection), so that points may slide along the shape; those that begin at an end of
+    the domain stay there. Weights of control points stay.
 
     **Arguments:** `solver`: any least-squares solver of optimistix; by default
-    `optimistix.LevenbergMarquardt`.
+    `optimistix.Dogleg`.
 
     **Statuses:** `not_converged` after `max_steps`; the result is the best so far.
 
@@ -44,7 +44,7 @@ def refine_fit(
     n = points.shape[0]
     weights = jnp.ones(n, points.dtype) if weights is None else floating(weights)
     root = float(jnp.finfo(points.dtype).eps) ** 0.5
-    solver = optx.LevenbergMarquardt(rtol=root, atol=root) if solver is None else solver
+    solver = optx.Dogleg(rtol=root, atol=root) if solver is None else solver
     begin = fit.parameters.reshape(n, -1)
     pulls = jnp.asarray(fit_pulls(fit.shape), points.dtype)
     given = (fit.shape, points, begin, weights, pulls, jnp.asarray(smoothing))
@@ -90,6 +90,9 @@ def _feet(shape, points, begin, corrections):
 def _foot(search, point, y, corrections):
     frozen, held = search.frozen(), jax.lax.stop_gradient(point)
     options = frozen.options(held, jax.lax.stop_gradient(y))
+    # At an end that may be left or not, the gap has a kink where descent would stick.
+    pinned = (y <= options["lower"]) | (y >= options["upper"])
+    options["still"] = jnp.where(pinned, jnp.inf, options["still"])
     gap = lambda x: frozen(x) - held
 
     def onward(carry, _):
@@ -102,9 +105,8 @@ def _foot(search, point, y, corrections):
     local = jax.lax.stop_gradient(model(gap, y))
     # The Newton step at the foot: nearly zero, its derivative that of the foot.
     slope = jax.jacfwd(search)(y).T @ (search(y) - point)
-    step = newton_step(
-        local.hessian, slope, is_free(local.jacobian, local.slope, y, options)
-    )
+    free = is_free(local.jacobian, local.slope, y, options)
+    step = newton_step(local, slope, free)
     return y + step - jax.lax.stop_gradient(step)
 
 

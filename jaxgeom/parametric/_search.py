@@ -47,4 +47,6 @@ class Search(eqx.Module):
         bounds = {"lower": jnp.array(lower, dtype), "upper": jnp.array(upper, dtype)}
         size = safe_norm(query) + safe_norm(self(y))
         rounding = 16 * jnp.finfo(dtype).eps * size
-        return {**bounds, "wrap": self.wrap, "rounding": rounding}
+        lengths = jnp.array([i.length for i in self.intervals], dtype)
+        still = rounding / lengths
+        return {**bounds, "wrap": self.wrap, "rounding": rounding, "still": still}

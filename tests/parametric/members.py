@@ -28,14 +28,15 @@ def saddle(uv):
     return jnp.stack([0.8 * u, 1.1 * v, 0.6 * u * v + 0.2 * jnp.sin(3 * u)])
 
 
-def net(seed=0, shape=(6, 5)):
-    """A wavy rational patch of degrees 3 and 2 with a double knot."""
+def net(seed=0, shape=(6, 5), crease=True):
+    """A wavy rational patch of degrees 3 and 2, with a double knot or without."""
     generator = np.random.default_rng(seed)
     u, v = np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij")
     control = np.stack([1.3 * u, 0.9 * v, 0.2 * generator.normal(size=shape)], -1)
     weights = generator.uniform(0.6, 1.7, shape)
     one = jp.SplineBasis([0, 0, 0, 0, 0.35, 0.6, 1, 1, 1, 1], 3)
-    two = jp.SplineBasis([-0.5, -0.5, -0.5, 0.1, 0.1, 1.2, 1.2, 1.2], 2)
+    inner = (0.1, 0.1) if crease else (0.1, 0.6)
+    two = jp.SplineBasis([-0.5, -0.5, -0.5, *inner, 1.2, 1.2, 1.2], 2)
     return jp.NurbsSurface(jnp.asarray(control), (one, two), jnp.asarray(weights))
 
 

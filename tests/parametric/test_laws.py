@@ -87,7 +87,7 @@ def check_mesh(mesh, known):
     assert (facing.max(axis=1) > 0).all()
 
 
-@pytest.mark.parametrize("name", ["ellipsoid", "cone", "tube", "nurbs"])
+@pytest.mark.parametrize("name", ["ellipsoid", "cone", "nurbs"])
 def test_single_precision(name):
     surface = in_dtype(surfaces()[name][0], jnp.float32)
     uv = parameters(surface, 3).astype(jnp.float32)
@@ -134,9 +134,10 @@ def test_degenerate_places_are_finite():
     """Where nothing is declared: normal and curvatures are zero, with finite slopes."""
     flat = jp.FunctionSurface(lambda uv: jnp.stack([uv[0], uv[0] ** 2, 0 * uv[1]]))
     uv = jnp.array([0.3, 0.4])
-    assert (jp.normal(flat, uv) == 0).all() and jp.curvatures(flat, uv).mean == 0
-    slope = jax.jacfwd(lambda x: jp.normal(flat, x))(uv)
-    assert jnp.isfinite(slope).all()
+    slope = lambda x: jax.jacfwd(lambda x: jp.normal(flat, x))(x)
+    at = jax.jit(lambda x: (jp.normal(flat, x), jp.curvatures(flat, x), slope(x)))
+    normal, bend, slopes = at(uv)
+    assert (normal == 0).all() and bend.mean == 0 and np.isfinite(slopes).all()
 
 
 def test_curvatures_of_a_torus_and_an_ellipsoid(x64):
