@@ -43,7 +43,7 @@ def trimmed():
     """A wavy rational patch with a star and a round hole cut out."""
     generator = np.random.default_rng(4)
     u, v = np.meshgrid(*[np.linspace(-1, 1, 7)] * 2, indexing="ij")
-    heights = 0.45 * generator.normal(size=(7, 7))
+    heights = 0.25 * generator.normal(size=(7, 7))
     basis = jp.SplineBasis.clamped(7, 3)
     patch = jp.NurbsSurface(np.stack([u, v, heights], -1), (basis, basis))
     turn = lambda n: np.linspace(0, 2 * np.pi, n, endpoint=False)[:, None]

@@ -90,6 +90,7 @@ FRAMES = jax.jit(
 )
 
 
+@pytest.mark.slow
 def test_a_frame_is_orthonormal_and_does_not_turn(x64):
     """On a helix the frame turns against the normal by the torsion: -tau s."""
     helix = jp.Helix(1.1, 0.6, 1.25)

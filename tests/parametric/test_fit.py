@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxgeom import RESULTS
 from jaxgeom import parametric as jp
@@ -105,6 +106,7 @@ REFINE = jax.jit(
 )
 
 
+@pytest.mark.slow
 def test_correction_of_parameters_improves_a_curve(x64):
     """Noise-free points of a cubic at unknown parameters: the cubic is found again."""
     basis = jp.SplineBasis.clamped(6, 3)

@@ -9,8 +9,11 @@ from jaxgeom import parametric as jp
 
 from .members import counted, in_dtype, parameters, surfaces
 
-NAMES = list(surfaces())
 RESOLUTION = (10, 8)
+LONG = {"tube", "offset", "nurbs", "nurbs sphere", "nurbs torus"}
+CASES = [
+    pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in surfaces()
+]
 
 
 @jax.jit
@@ -40,7 +43,7 @@ def all_about(surface, uv):
     }
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", CASES)
 def test_every_surface(name, x64):
     surface, known = surfaces()[name]
     surface = in_dtype(surface, jnp.float64)

@@ -102,7 +102,11 @@ def test_cells_end_at_knots():
         assert np.isclose(u, knot).any()
 
 
-@pytest.mark.parametrize("name", list(SHAPES))
+LONG = {"circle", "needle", "finer than the cells", "star"}
+CASES = [pytest.param(n, marks=pytest.mark.slow if n in LONG else ()) for n in SHAPES]
+
+
+@pytest.mark.parametrize("name", CASES)
 def test_trimmed_surfaces_are_exact(name, x64):
     loops = SHAPES[name]
     mesh = jp.tessellate_trimmed(PATCH, loops, (16, 12))
