@@ -1,0 +1,161 @@
+"""Distances along the surface by the heat method."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from .._core import (
+    RESULTS,
+    check_shape,
+    failure_where,
+    first_failure,
+    safe_divide,
+    safe_normalize,
+)
+from ..linear import conjugate_gradients
+from ..shapes import TriangleMesh
+from ._edge_list import VertexNeighbors, vertex_neighbors
+from ._edges import components
+from ._heat import HeatSystem, solve_heat
+from ._intrinsic import FlatFaces, flat_triangles
+
+
+class Geodesics(eqx.Module):
+    """Distances along a surface from the nearest source.
+
+    `distances` [v] are infinite for vertices that no source is connected to and for
+    padding. `heat_steps`, `poisson_steps`: the iterations of the two solvers;
+    `residual`: that of the second one, |b - L d| / |b|.
+    """
+
+    distances: Float[Array, " v"]
+    heat_steps: Int[Array, ""]
+    poisson_steps: Int[Array, ""]
+    residual: Float[Array, ""]
+    result: RESULTS
+
+
+def geodesic_distance(
+    mesh: TriangleMesh,
+    sources: Int[Array, " s"],
+    *,
+    neighbors: VertexNeighbors | None = None,
+    smoothness: Float[Array, ""] | float = 1.0,
+    rtol: float = 1e-4,
+    max_steps: int = 4000,
+) -> Geodesics:
+    """The distance d along the surface from the nearest of the vertices `sources`.
+
+    1. Heat for a short time: (M + t L) u = 1 at the sources, t = smoothness h^2 with
+       the mean edge length h.
+    2. Its direction in every face: X = -grad u / |grad u|.
+    3. The function whose gradient is nearest to it: L d = div X, d = 0 at the sources.
+
+    `sources` [s] holds indices of vertices; v is padding, so that sets of several sizes
+    can be batched. `neighbors` is the table of `vertex_neighbors`, measured on the host
+    if left out; under jit and for many calls pass it. A larger `smoothness` gives
+    smoother distances, rounded where fronts meet. The error is of first order in h; on
+    a surface of faces it is largest next to the sources, in proportion.
+    `rtol` and `max_steps` belong to both solvers (`heat_steps`, `poisson_steps` tell).
+    Differentiable in the vertices, by the implicit function theorem.
+
+    Statuses: `not_converged`; `capacity_exceeded` of the table of neighbors;
+    `degenerate_input` where there is no source on the surface.
+
+    Source: K. Crane, C. Weischedel, M. Wardetzky, Geodesics in heat, 2013.
+    """
+    check_shape("sources", sources, (None,))
+    v = mesh.vertices.shape[0]
+    table = vertex_neighbors(mesh) if neighbors is None else neighbors
+    source = jnp.zeros(v, bool).at[jnp.asarray(sources)].set(True, mode="drop")
+    flat = flat_triangles(mesh)
+    weights = _edge_weights(flat, table)
+    system, unit = _heat_system(mesh, flat, table, weights, source, smoothness)
+    heat = solve_heat(system, tolerance=rtol, max_steps=max_steps)
+    slope = _divergence(mesh, flat, heat.value)
+    start = lax.stop_gradient(jnp.where(jnp.isfinite(heat.value), unit * heat.value, 0))
+    found = _integrate(table, weights, slope, start, rtol, max_steps)
+    distances = _from_sources(table, found.value, source, heat.value)
+    lost = ~jnp.any(jnp.isfinite(distances))
+    result = first_failure(
+        table.result,
+        failure_where(lost, RESULTS.degenerate_input),
+        heat.result,
+        found.result,
+    )
+    return Geodesics(distances, heat.steps, found.steps, found.residual, result)
+
+
+def _edge_weights(flat: FlatFaces, table: VertexNeighbors):
+    """(cot + cot) / 2 of the angles opposite to each edge, in the table [k, v]."""
+    of_faces = table.edge_list.of_faces
+    e = table.edge_list.mask.shape[0]
+    # The edge from corner d to d + 1 is opposite to corner d + 2.
+    opposite = jnp.roll(flat.cotangents, -2, axis=1)
+    total = jnp.zeros(e, flat.areas.dtype).at[of_faces].add(opposite / 2, mode="drop")
+    return total.at[table.edges].get(mode="fill", fill_value=0)
+
+
+def _heat_system(mesh, flat, table, weights, source, smoothness):
+    """The heat system in units of the mean edge, and the length of one unit of log."""
+    v = source.shape[0]
+    number = jnp.maximum(3 * jnp.sum(flat.areas > 0), 1)
+    mean = jnp.sum(flat.lengths) / number
+    time = smoothness * mean**2
+    third = jnp.broadcast_to(flat.areas[:, None] / 3, flat.lengths.shape)
+    mass = jnp.zeros(v, flat.areas.dtype).at[mesh.faces].add(third, mode="drop")
+    mass = safe_divide(mass, time)
+    # Of a triangulation that is not Delaunay some weights are negative: heat would not
+    # be positive. Which way it flows is hardly changed without them.
+    system = HeatSystem(jnp.maximum(weights, 0), mass, table.vertices, source)
+    return system, jnp.sqrt(jnp.where(time > 0, time, 1))
+
+
+def _divergence(mesh, flat, log):
+    """The integrated divergence of the unit field against the gradient of heat."""
+    faces = jnp.where(mesh.face_mask[:, None], mesh.faces, log.shape[0])
+    at = log.at[faces].get(mode="fill", fill_value=jnp.inf)
+    low = jnp.min(at, axis=1, keepdims=True)
+    heated = jnp.isfinite(low)
+    finite = jnp.isfinite(at) & heated
+    gap = jnp.where(finite, at, 0) - jnp.where(heated, low, 0)
+    # Constants do not matter: relative to the warmest corner no digit is lost.
+    heat = jnp.where(finite, jnp.expm1(-jnp.where(finite, gap, 0)), -1)
+    heat = jnp.where(heated, heat, 0)
+    across = safe_normalize(jnp.einsum("fd,fdx->fx", heat, flat.sides))
+    flux = jnp.einsum("fdx,fx->fd", flat.sides, across) / 2
+    return jnp.zeros_like(log).at[faces].add(-flux, mode="drop")
+
+
+def _integrate(table, weights, slope, start, rtol, max_steps):
+    """The solution of L d = slope, from the multiple of `start` that is best."""
+    total = jnp.sum(weights, axis=0)
+
+    def laplacian(x):
+        near = x.at[table.vertices].get(mode="fill", fill_value=0)
+        return total * x - jnp.sum(weights * near, axis=0)
+
+    diagonal = jnp.where(total > 0, total, 1)
+    rise = lax.stop_gradient(laplacian(start))
+    scale = safe_divide(jnp.vdot(start, slope), jnp.vdot(start, rise))
+    start = lax.stop_gradient(scale) * start
+    solution = conjugate_gradients(
+        laplacian,
+        slope - laplacian(start),
+        rtol=rtol,
+        max_steps=max_steps,
+        preconditioner=lambda r: r / lax.stop_gradient(diagonal),
+    )
+    return eqx.tree_at(lambda s: s.value, solution, start + solution.value)
+
+
+def _from_sources(table, height, source, log):
+    """The height above the lowest source of the same component."""
+    v = height.shape[0]
+    ends = table.edge_list.vertices
+    labels = components(v, ends[:, 0], ends[:, 1])
+    high = jnp.where(source & jnp.isfinite(log), height, jnp.inf)
+    lowest = jnp.full(v, jnp.inf, height.dtype).at[labels].min(high)[labels]
+    reached = jnp.isfinite(lowest) & jnp.isfinite(log)
+    return jnp.where(reached, height - jnp.where(reached, lowest, 0), jnp.inf)
