@@ -11,7 +11,6 @@ vertex, and can be done on logarithms.
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -127,7 +126,9 @@ def _terms(system, log):
     """-log(w u) of every neighbor: infinite where there is none or no heat."""
     there = system.weights > 0
     near = log.at[system.rows].get(mode="fill", fill_value=jnp.inf)
-    return jnp.where(there, near - jnp.log(jnp.where(there, system.weights, 1)), jnp.inf)
+    return jnp.where(
+        there, near - jnp.log(jnp.where(there, system.weights, 1)), jnp.inf
+    )
 
 
 def _lowest(system, terms):
