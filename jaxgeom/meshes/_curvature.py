@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from .._core import safe_divide, safe_norm, safe_normalize
 from ..shapes import TriangleMesh
-from ._edge_list import boundary_vertices
+from ._edge_list import boundary_vertices, edges
 from ._geometry import (
     AngleWeights,
     SphereWeights,
@@ -21,6 +21,7 @@ from ._laplacian import (
     lumped_mass,
     sum_at_vertices,
 )
+from ._small import solve_three
 
 
 def mean_curvature_vectors(mesh: TriangleMesh) -> Float[Array, "v 3"]:
@@ -58,13 +59,17 @@ def angle_defects(mesh: TriangleMesh) -> Float[Array, " v"]:
 
     The integral of the Gaussian curvature around the vertex, and of the geodesic
     curvature of the boundary: the sum is 2 pi times the Euler characteristic (Gauss and
-    Bonnet). Zero for padding and for vertices without faces.
+    Bonnet). That holds for every mesh: an edge with n faces takes pi (2 - n) / 2 from
+    both of its ends. Zero for padding and for vertices without faces.
     """
     angles = AngleWeights().at_corners(corners(mesh))
     total = sum_at_vertices(mesh, angles)
-    whole = jnp.where(boundary_vertices(mesh), jnp.pi, 2 * jnp.pi)
-    used = sum_at_vertices(mesh, jnp.ones_like(angles)) > 0
-    return jnp.where(used, whole.astype(total.dtype) - total, 0)
+    found = edges(mesh)
+    lack = jnp.where(found.mask, jnp.pi / 2 * (2 - found.num_faces), 0)
+    ends = jnp.broadcast_to(lack.astype(total.dtype)[:, None], found.vertices.shape)
+    lack = jnp.zeros_like(total).at[found.vertices].add(ends, mode="drop")
+    used = jnp.zeros(total.shape, bool).at[found.vertices].set(True, mode="drop")
+    return jnp.where(used, 2 * jnp.pi - lack - total, 0)
 
 
 def gaussian_curvature(mesh: TriangleMesh) -> Float[Array, " v"]:
@@ -139,18 +144,8 @@ def _face_shape(triangle, normals, normal):
     matrix = jnp.stack([jnp.stack([x, y, zero], -1), jnp.stack([zero, x, y], -1)])
     matrix = matrix.reshape(6, 3)
     target = safe_divide(turns, scale).T.reshape(6)
-    e, f, g = _solve(matrix.T @ matrix, matrix.T @ target)
+    e, f, g = solve_three(matrix.T @ matrix, matrix.T @ target)
     return basis.T @ jnp.array([[e, f], [f, g]]) @ basis
-
-
-def _solve(matrix, right):
-    """Cramer's rule for three symmetric equations; zero where they are singular."""
-    a, b, c = matrix
-    minors = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=-1)
-    determinant = jnp.dot(a, jnp.cross(b, c))
-    # The columns are scaled to a sum of squares of one: smaller is rounding.
-    sound = determinant > jnp.finfo(right.dtype).eps ** 2
-    return jnp.where(sound, minors @ right, 0) / jnp.where(sound, determinant, 1)
 
 
 def _frame(normal):
