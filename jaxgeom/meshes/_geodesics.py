@@ -24,6 +24,9 @@ from ._intrinsic import FlatFaces, flat_triangles
 from ._topology import proper_faces
 from ._unfold import unfold
 
+# The most that heat flows along an edge: the cotangent of about 6 degrees.
+_STRONGEST = 10.0
+
 
 class Geodesics(eqx.Module):
     """Distances along a surface from the nearest source.
@@ -158,9 +161,11 @@ def _heat_system(mesh, flat, table, weights, source, smoothness):
     third = jnp.broadcast_to(flat.areas[:, None] / 3, flat.lengths.shape)
     mass = jnp.zeros(v, flat.areas.dtype).at[mesh.faces].add(third, mode="drop")
     mass = safe_divide(mass, time)
-    # Of a triangulation that is not Delaunay some weights are negative: heat would not
-    # be positive. Which way it flows is hardly changed without them.
-    system = HeatSystem(jnp.maximum(weights, 0), mass, table.vertices, source)
+    # Of a triangulation that is not Delaunay some weights are negative, and heat would
+    # not be positive; across the slivers next to short edges they are huge, and the
+    # iteration would not end. Which way heat flows is hardly changed.
+    weights = jnp.clip(weights, 0, _STRONGEST)
+    system = HeatSystem(weights, mass, table.vertices, source)
     return system, jnp.sqrt(jnp.where(time > 0, time, 1))
 
 

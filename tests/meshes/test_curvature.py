@@ -215,43 +215,61 @@ def test_curvature_follows_scale_and_side(x64):
     np.testing.assert_allclose(outward, 1, rtol=1e-3)
 
 
-def probed(x, like, probe):
-    """One number from all curvatures."""
-    counts = {"num_vertices": like.num_vertices, "num_faces": like.num_faces}
-    mesh = TriangleMesh(x, like.faces, **counts)
+def like(x, mesh):
+    """The mesh with other vertices."""
+    counts = {"num_vertices": mesh.num_vertices, "num_faces": mesh.num_faces}
+    return TriangleMesh(x, mesh.faces, **counts)
+
+
+def probed(x, mesh, probe):
+    """One number from the curvatures that the Laplacian and the angles give."""
+    mesh = like(x, mesh)
     washed = jnp.where(mesh.vertex_mask[:, None], x, 0)
     parts = [
         mean_curvature(mesh),
         gaussian_curvature(mesh),
-        *principal_curvatures(mesh).values.T,
         lumped_mass(mesh, areas=MixedVoronoiAreas()),
         cotangent_laplacian(mesh) @ jnp.sin(washed[:, 0]),
     ]
-    return jnp.sum(probe * jnp.stack(parts))
+    return jnp.sum(probe[:4] * jnp.stack(parts))
 
 
-SLOPE = jax.jit(jax.grad(probed))
+def probed_principal(x, mesh, probe):
+    """One number from the principal curvatures and directions."""
+    found = principal_curvatures(like(x, mesh))
+    squares = jnp.sum(found.directions**2 * jnp.arange(3), axis=-1)
+    return jnp.sum(probe[:4] * jnp.concatenate([found.values.T, squares.T]))
 
 
-def test_gradients_are_central_differences(x64):
-    mesh = sized(cut(closed_meshes()["torus"]), garbage=3.7)
-    probe = jax.random.normal(jax.random.key(5), (6, 900))
-    way = jax.random.normal(jax.random.key(6), (900, 3))
-    value = lambda x: probed(x, mesh, probe)
+SLOPES = {f: jax.jit(jax.grad(f)) for f in (probed, probed_principal)}
+
+
+@pytest.mark.parametrize(
+    "function", [probed, pytest.param(probed_principal, marks=pytest.mark.slow)]
+)
+def test_gradients_are_central_differences(x64, function):
+    mesh = sized(cut(closed_meshes()["torus"]), 130, 250, garbage=3.7)
+    probe = jax.random.normal(jax.random.key(5), (6, 130))
+    way = jax.random.normal(jax.random.key(6), (130, 3))
+    value = lambda x: function(x, mesh, probe)
     numeric = central_difference(value, mesh.vertices, way, step=1e-6)
-    slope = SLOPE(mesh.vertices, mesh, probe)
+    slope = SLOPES[function](mesh.vertices, mesh, probe)
     assert np.vdot(slope, way) == pytest.approx(float(numeric), rel=1e-6)
     assert np.all(slope[int(mesh.num_vertices) :] == 0)
 
 
-def test_degenerate_faces_have_finite_gradients(x64):
+@pytest.mark.parametrize(
+    "function", [probed, pytest.param(probed_principal, marks=pytest.mark.slow)]
+)
+def test_degenerate_faces_have_finite_gradients(x64, function):
     line = [[0.2, 0.1, 0], [1.3, 0, 0], [2.4, -0.1, 0], [0.2, 0.1, 0]]
     faces = np.array([[0, 1, 2], [0, 0, 1], [0, 3, 1], [1, 1, 1]])
-    mesh = sized(TriangleMesh(np.array(line), faces))
-    slope = SLOPE(mesh.vertices, mesh, jnp.ones((6, 900)))
+    mesh = sized(TriangleMesh(np.array(line), faces), 130, 250)
+    slope = SLOPES[function](mesh.vertices, mesh, jnp.ones((6, 130)))
     assert np.all(np.isfinite(slope))
 
 
+@pytest.mark.slow
 def test_a_batch_in_single_precision_is_each_in_double():
     meshes = [closed_meshes()["torus"], bent(icosphere(2)), flat_patch()]
     small = [sized(m, dtype=np.float32) for m in meshes]
