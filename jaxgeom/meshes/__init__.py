@@ -86,3 +86,4 @@ from ._topology import Components as Components
 from ._topology import Topology as Topology
 from ._topology import face_components as face_components
 from ._topology import topology as topology
+from ._voxelize import voxelize as voxelize

@@ -3,6 +3,7 @@
 from abc import abstractmethod
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -49,6 +50,10 @@ class AbstractGeodesics(eqx.Module):
     def measure(self, mesh: TriangleMesh, source: Bool[Array, " v"]) -> Geodesics:
         """The distances from the vertices where `source` is true."""
 
+    @abstractmethod
+    def prepared(self, mesh: TriangleMesh) -> "AbstractGeodesics":
+        """The same way, with what has to be measured on the host."""
+
 
 class Unfolding(AbstractGeodesics):
     """Straight lines through unfolded triangles, the least of all offers.
@@ -64,6 +69,9 @@ class Unfolding(AbstractGeodesics):
     """
 
     max_steps: int = eqx.field(static=True, default=4000)
+
+    def prepared(self, mesh):
+        return self
 
     def measure(self, mesh, source):
         v = source.shape[0]
@@ -95,8 +103,14 @@ class Heat(AbstractGeodesics):
     rtol: float = eqx.field(static=True, default=1e-4)
     max_steps: int = eqx.field(static=True, default=4000)
 
+    def prepared(self, mesh):
+        if self.neighbors is not None:
+            return self
+        table = vertex_neighbors(mesh)
+        return Heat(table, self.smoothness, self.rtol, self.max_steps)
+
     def measure(self, mesh, source):
-        table = vertex_neighbors(mesh) if self.neighbors is None else self.neighbors
+        table = self.neighbors
         flat = flat_triangles(mesh)
         weights = _edge_weights(flat, table)
         system, unit = _heat_system(mesh, flat, table, weights, source, self.smoothness)
@@ -136,10 +150,16 @@ def geodesic_distance(
     source = jnp.zeros(v, bool)
     source = source.at[jnp.where(sources < 0, v, sources)].set(True, mode="drop")
     source &= on_surface & mesh.vertex_mask
-    out = method.measure(mesh, source)
+    out = _measure(method.prepared(mesh), mesh, source)
     lost = failure_where(~jnp.any(source), RESULTS.degenerate_input)
     result = first_failure(lost, out.result)
     return Geodesics(out.distances, out.steps, out.residual, result)
+
+
+# Outside jit, loops would compile what they close over as constants (slowly).
+@jax.jit
+def _measure(method, mesh, source):
+    return method.measure(mesh, source)
 
 
 def _edge_weights(flat: FlatFaces, table: VertexNeighbors):

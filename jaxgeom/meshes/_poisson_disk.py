@@ -1,6 +1,7 @@
 """Random points on a surface, no two of them near each other."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -92,6 +93,8 @@ def disk_radius(mesh: TriangleMesh, num: int) -> Float[Array, ""]:
     return jnp.sqrt(_PACKING * area(mesh) / num)
 
 
+# Outside jit, loops would compile what they close over as constants (slowly).
+@jax.jit
 def _throw(points, mask, radius):
     """Which points are taken when each one in turn keeps its distance."""
     n = points.shape[0]

@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -141,10 +142,16 @@ def smooth(
         check_shape("fixed", fixed, (mesh.vertices.shape[0],))
         free = free & ~jnp.asarray(fixed)
     points = jnp.where(mesh.vertex_mask[:, None], mesh.vertices, 0)
-    out = method.filter(mesh, points, free)
+    out = _filter(method, mesh, points, free)
     real = mesh.vertex_mask[:, None]
     washed = jnp.where(real, out.mesh.vertices, 0)
     return eqx.tree_at(lambda s: s.mesh.vertices, out, washed)
+
+
+# Outside jit, loops would compile what they close over as constants (slowly).
+@jax.jit
+def _filter(method, mesh, points, free):
+    return method.filter(mesh, points, free)
 
 
 def _mover(operator, free):

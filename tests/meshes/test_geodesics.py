@@ -140,7 +140,7 @@ def test_gradients_are_central_differences(x64):
 @pytest.mark.slow
 def test_heat_gradients_are_central_differences(x64):
     def tight(mesh, sources):
-        method = Heat(vertex_neighbors(mesh, capacity=9), rtol=1e-13)
+        method = Heat(vertex_neighbors(mesh, capacity=9), rtol=1e-12)
         return geodesic_distance(mesh, sources, method)
 
     _check_gradient(tight, 1e-5)
@@ -210,7 +210,7 @@ def test_heat_statuses(x64):
 def test_large_single_precision_meshes_converge():
     mesh = icosphere(5, radius=1.3)
     truth = arcs(mesh, 5)
-    for method, bound in ((Unfolding(), 0.004), (Heat(), 0.01)):
+    for method, bound in ((Unfolding(), 0.004), (Heat(), 0.013)):
         found = geodesic_distance(mesh, jnp.array([5]), method)
         assert found.result == RESULTS.successful
         assert np.mean(np.abs(found.distances - truth)) < bound
