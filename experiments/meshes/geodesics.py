@@ -1,6 +1,7 @@
 """How near geodesic distances come to the exact ones, and how long they take (CPU).
 
     JAXGEOM_DATA=... python experiments/meshes/geodesics.py --meshes bunny nefertiti
+    JAXGEOM_DATA=... python experiments/meshes/geodesics.py --times
     JAXGEOM_DATA=... python experiments/meshes/geodesics.py --picture geodesics.png
 
 Exact distances over the faces come from libigl (window propagation); potpourri3d has
@@ -21,8 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 import potpourri3d
 import trimesh
+from matplotlib import pyplot
 
 from jaxgeom import TriangleMesh
+from jaxgeom.fields import Camera
 from jaxgeom.meshes import (
     Heat,
     Unfolding,
@@ -30,6 +33,7 @@ from jaxgeom.meshes import (
     icosphere,
     vertex_neighbors,
 )
+from jaxgeom.render import render_mesh, save_png, side_by_side
 
 SOURCES = 3
 
@@ -111,6 +115,21 @@ def compare(name):
         show("potpourri3d, prefactored", found, truth, source, seconds)
 
 
+def times(name):
+    """Seconds for one source, without exact distances: medians of five."""
+    mesh = load(name)
+    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    factor = lambda _: potpourri3d.MeshHeatMethodDistanceSolver(vertices, faces)
+    solver = factor(0)
+    methods = ours(mesh) | {
+        "potpourri3d, factorisation": factor,
+        "potpourri3d, solution": solver.compute_distance,
+    }
+    for method, function in methods.items():
+        seconds = np.median([timed(function, 100)[1] for _ in range(5)])
+        print(f"{name}, {len(vertices)} vertices, {method}: {seconds:.3f} s")
+
+
 def order():
     """Mean errors against great circles, from mesh to mesh of half the edge."""
     last = {}
@@ -129,37 +148,46 @@ def order():
             last[name] = error
 
 
-def picture(path):
-    """Bands of distance on the bunny, from its nose."""
-    from matplotlib import pyplot
-    from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+def refined(vertices, faces, values):
+    """Every face split in four, the values interpolated."""
+    edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1), axis=-1)
+    unique, middle = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+    middle = middle.reshape(-1, 3) + len(vertices)
+    grow = lambda x: np.concatenate([x, x[unique].mean(axis=1)])
+    corner = [
+        np.stack([faces[:, d], middle[:, d], middle[:, d - 1]], -1) for d in range(3)
+    ]
+    return grow(vertices), np.concatenate([*corner, middle]), grow(values)
 
+
+def banded(mesh, distance):
+    """The mesh, finer, with bands of distance in the attribute `colors`."""
+    parts = np.asarray(mesh.vertices, float), np.asarray(mesh.faces), distance
+    for _ in range(2):
+        parts = refined(*parts)
+    vertices, faces, distance = parts
+    at = distance / distance.max()
+    band = np.clip(0.5 + 3 * np.sin(2 * np.pi * 18 * at), 0, 1)
+    color = pyplot.get_cmap("viridis")(at)[:, :3]
+    color = color * (0.35 + 0.65 * band)[:, None]
+    attributes = {"colors": color.astype(np.float32)}
+    return TriangleMesh(vertices.astype(np.float32), faces, None, attributes)
+
+
+def picture(path):
+    """Bands of distance on the bunny from the tip of an ear, both methods."""
     mesh = load("bunny")
-    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
-    figure = pyplot.figure(figsize=(11, 5.2))
+    vertices = np.asarray(mesh.vertices, float)
+    middle = (vertices.max(axis=0) + vertices.min(axis=0)) / 2
+    size = np.ptp(vertices, axis=0).max()
+    eye = middle + size * np.array([-0.55, 0.35, 2.1])
+    camera = Camera(eye, middle, (0.0, 1.0, 0.0))
     source = int(np.argmax(vertices[:, 1]))
-    for place, (name, function) in enumerate(ours(mesh).items()):
+    views = []
+    for function in ours(mesh).values():
         distance = np.asarray(function(source).distances, float)
-        panel = figure.add_subplot(1, 2, place + 1, projection="3d")
-        at = distance[faces].mean(axis=1) / distance.max()
-        band = 0.5 + 0.5 * np.sign(np.sin(2 * np.pi * 16 * at))
-        a, b, c = np.moveaxis(vertices[faces], 1, 0)
-        normal = np.cross(b - a, c - a)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        light = 0.45 + 0.55 * np.clip(normal @ np.array([0.3, 0.6, 0.74]), 0, 1)
-        color = pyplot.get_cmap("viridis")(at)[:, :3] * (0.55 + 0.45 * band)[:, None]
-        shown = vertices[faces][:, :, [0, 2, 1]] * np.array([1, -1, 1])
-        panel.add_collection3d(
-            Poly3DCollection(shown, facecolors=color * light[:, None], lw=0)
-        )
-        flat = shown.reshape(-1, 3)
-        panel.auto_scale_xyz(*flat.T)
-        panel.set_box_aspect(np.ptp(flat, axis=0), zoom=1.5)
-        panel.view_init(elev=12, azim=-90)
-        panel.set_axis_off()
-        panel.set_title(name)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
+        views.append(render_mesh(banded(mesh, distance), camera, size=(520, 520)))
+    save_png(path, side_by_side(views))
 
 
 def main():
@@ -167,13 +195,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--meshes", nargs="*", default=["bunny"])
     parser.add_argument("--picture")
+    parser.add_argument("--times", action="store_true")
     options = parser.parse_args()
     if options.picture:
         picture(options.picture)
         return
     for name in options.meshes:
-        compare(name)
-    order()
+        (times if options.times else compare)(name)
+    if not options.times:
+        order()
 
 
 if __name__ == "__main__":

@@ -118,9 +118,12 @@ class Heat(AbstractGeodesics):
         slope = _divergence(mesh, flat, heat.value)
         reached = jnp.isfinite(heat.value)
         start = lax.stop_gradient(jnp.where(reached, unit * heat.value, 0))
-        found = _integrate(table, weights, slope, start, self.rtol, self.max_steps)
+        labels = _vertex_components(table, source.shape[0])
+        found = _integrate(
+            (table, weights, labels), slope, start, self.rtol, self.max_steps
+        )
         return Geodesics(
-            _from_sources(table, found.value, source, heat.value),
+            _from_sources(labels, found.value, source, heat.value),
             heat.steps + found.steps,
             found.residual,
             first_failure(table.result, heat.result, found.result),
@@ -205,33 +208,43 @@ def _divergence(mesh, flat, log):
     return jnp.zeros_like(log).at[faces].add(-flux, mode="drop")
 
 
-def _integrate(table, weights, slope, start, rtol, max_steps):
+def _vertex_components(table, v):
+    ends = table.edge_list.vertices
+    return components(v, ends[:, 0], ends[:, 1])
+
+
+def _integrate(surface, slope, start, rtol, max_steps):
     """The solution of L d = slope, from the multiple of `start` that is best."""
+    table, weights, labels = surface
     total = jnp.sum(weights, axis=0)
 
     def laplacian(x):
         near = x.at[table.vertices].get(mode="fill", fill_value=0)
         return total * x - jnp.sum(weights * near, axis=0)
 
-    diagonal = jnp.where(total > 0, total, 1)
+    number = jnp.zeros_like(slope).at[labels].add(1)[labels]
+
+    def centered(x):
+        # Constants on a component are invisible to L: rounding must not feed them.
+        return x - jnp.zeros_like(x).at[labels].add(x)[labels] / number
+
+    diagonal = lax.stop_gradient(jnp.where(total > 0, total, 1))
     rise = lax.stop_gradient(laplacian(start))
     scale = safe_divide(jnp.vdot(start, slope), jnp.vdot(start, rise))
     start = lax.stop_gradient(scale) * start
     solution = conjugate_gradients(
         laplacian,
-        slope - laplacian(start),
+        centered(slope - laplacian(start)),
         rtol=rtol,
         max_steps=max_steps,
-        preconditioner=lambda r: r / lax.stop_gradient(diagonal),
+        preconditioner=lambda r: centered(centered(r) / diagonal),
     )
     return eqx.tree_at(lambda s: s.value, solution, start + solution.value)
 
 
-def _from_sources(table, height, source, log):
+def _from_sources(labels, height, source, log):
     """The height above the lowest source of the same component."""
     v = height.shape[0]
-    ends = table.edge_list.vertices
-    labels = components(v, ends[:, 0], ends[:, 1])
     high = jnp.where(source & jnp.isfinite(log), height, jnp.inf)
     lowest = jnp.full(v, jnp.inf, height.dtype).at[labels].min(high)[labels]
     reached = jnp.isfinite(lowest) & jnp.isfinite(log)

@@ -40,15 +40,31 @@ class HeatSystem(eqx.Module):
 
     def step(self, log: Float[Array, " v"]) -> Float[Array, " v"]:
         """One iteration of Jacobi on -log u."""
-        return _log_mean(self, _terms(self, log))
+        parts, own, low = _heat(self, log)
+        total = jnp.sum(parts, axis=0) + own
+        whole = self.mass + jnp.sum(self.weights, axis=0)
+        heated = (total > 0) & (whole > 0)
+        ratio = jnp.where(heated, whole, 1) / jnp.where(heated, total, 1)
+        return jnp.where(heated, low + jnp.log(ratio), jnp.inf)
 
     def shares(self, log: Float[Array, " v"]) -> Float[Array, "k v"]:
         """How much of the heat at each vertex came from each neighbor."""
-        terms = _terms(self, log)
-        low = _lowest(self, terms)
-        parts = jnp.exp(-(terms - low))
-        total = jnp.sum(parts, axis=0) + jnp.where(self.source, jnp.exp(low), 0)
+        parts, own, _ = _heat(self, log)
+        total = jnp.sum(parts, axis=0) + own
         return parts / jnp.where(total > 0, total, 1)
+
+
+def _heat(system, log):
+    """What comes from every neighbor and from the source, and the log of the unit."""
+    near = log.at[system.rows].get(mode="fill", fill_value=jnp.inf)
+    there = (system.weights > 0) & jnp.isfinite(near)
+    near = jnp.where(there, near, 0)
+    low = jnp.min(jnp.where(there, near, jnp.inf), axis=0, initial=jnp.inf)
+    low = jnp.where(system.source, jnp.minimum(low, 0), low)
+    low = lax.stop_gradient(jnp.where(jnp.isfinite(low), low, 0))
+    fading = jnp.exp(-jnp.where(there, near - low, 0))
+    own = jnp.where(system.source, jnp.exp(low), 0)
+    return jnp.where(there, system.weights * fading, 0), own, low
 
 
 def solve_heat(system: HeatSystem, *, tolerance, max_steps: int) -> HeatLog:
@@ -120,31 +136,3 @@ def _sum_of_walks(walk: Callable, b, tolerance, max_steps):
         return total + term, term, steps + 1
 
     return lax.while_loop(more, once, (b, b, jnp.int32(0)))[0]
-
-
-def _terms(system, log):
-    """-log(w u) of every neighbor: infinite where there is none or no heat."""
-    there = system.weights > 0
-    near = log.at[system.rows].get(mode="fill", fill_value=jnp.inf)
-    return jnp.where(
-        there, near - jnp.log(jnp.where(there, system.weights, 1)), jnp.inf
-    )
-
-
-def _lowest(system, terms):
-    """The least of the terms, to be taken out of the exponentials; 0 if infinite."""
-    low = jnp.min(terms, axis=0, initial=jnp.inf)
-    low = jnp.where(system.source, jnp.minimum(low, 0), low)
-    return lax.stop_gradient(jnp.where(jnp.isfinite(low), low, 0))
-
-
-def _log_mean(system, terms):
-    low = _lowest(system, terms)
-    there = jnp.isfinite(terms)
-    gap = jnp.where(there, terms - low, 0)
-    total = jnp.sum(jnp.where(there, jnp.exp(-gap), 0), axis=0)
-    total = total + jnp.where(system.source, jnp.exp(low), 0)
-    whole = system.mass + jnp.sum(system.weights, axis=0)
-    heated = (total > 0) & (whole > 0)
-    ratio = jnp.where(heated, whole, 1) / jnp.where(heated, total, 1)
-    return jnp.where(heated, low + jnp.log(ratio), jnp.inf)

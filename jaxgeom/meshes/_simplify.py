@@ -84,9 +84,10 @@ def decimate(
     mesh = mesh.trim()
     if mesh.faces.shape[0] <= num_faces:
         return mesh
+    # Copies: the library refuses arrays that it may not write to.
     vertices, faces = fast_simplification.simplify(
-        np.asarray(mesh.vertices),
-        np.asarray(mesh.faces),
+        np.array(mesh.vertices),
+        np.array(mesh.faces),
         target_count=num_faces,
         agg=aggressiveness,
     )
