@@ -4,6 +4,17 @@ from ._creases import AbstractDecay as AbstractDecay
 from ._creases import ChaikinDecay as ChaikinDecay
 from ._creases import Creases as Creases
 from ._creases import UniformDecay as UniformDecay
+from ._curves import AbstractCurveScheme as AbstractCurveScheme
+from ._curves import Chaikin as Chaikin
+from ._curves import FourPoint as FourPoint
+from ._curves import LaneRiesenfeld as LaneRiesenfeld
+from ._curves import curve_limit as curve_limit
+from ._curves import curve_refinement as curve_refinement
+from ._curves import subdivide_curve as subdivide_curve
+from ._ends import AbstractEnds as AbstractEnds
+from ._ends import Closed as Closed
+from ._ends import FreeEnds as FreeEnds
+from ._ends import KeptEnds as KeptEnds
 from ._limit import Limit as Limit
 from ._limit import limit as limit
 from ._operator import Refinement as Refinement
