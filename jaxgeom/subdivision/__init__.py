@@ -15,6 +15,8 @@ from ._ends import AbstractEnds as AbstractEnds
 from ._ends import Closed as Closed
 from ._ends import FreeEnds as FreeEnds
 from ._ends import KeptEnds as KeptEnds
+from ._fit import ControlFit as ControlFit
+from ._fit import fit_control_mesh as fit_control_mesh
 from ._limit import Limit as Limit
 from ._limit import limit as limit
 from ._operator import Refinement as Refinement

@@ -61,8 +61,9 @@ def limit(
     for each, but only rows of the vertices of `mesh` are kept.
 
     At a fixed vertex between two sharp edges the tangents are these edges. With more
-    than 2 (Loop: 3) faces between them, or without any, the published corner rule has a
-    cone or a cusp instead of a tangent plane (Biermann, Levin, Zorin 2000).
+    than 2 (Loop: 3) faces between them, or with less than two sharp edges, the
+    published corner rule has a cone or a cusp instead of a tangent plane (Biermann,
+    Levin, Zorin 2000), and the normal is only a guess.
 
     Raises `GeometryError` as `subdivide` does, for inconsistent orientation, and for
     schemes other than `Loop` and `CatmullClark`.

@@ -164,9 +164,10 @@ def identity_band(start: int, stop: int) -> Band:
 
 
 def on_device(tree):
-    """The arrays of the host as JAX arrays in the default precision."""
-    move = lambda x: jnp.asarray(x, float if x.dtype.kind == "f" else jnp.int32)
-    return jax.tree.map(move, tree)
+    """The arrays of the host as JAX arrays, reals in the default precision."""
+    real = jax.dtypes.canonicalize_dtype(float)
+    cast = lambda x: x.astype(real if x.dtype.kind == "f" else np.int32, copy=False)
+    return jax.device_put(jax.tree.map(cast, tree))
 
 
 def _cheapest_width(length) -> int:

@@ -47,7 +47,8 @@ class Subdivided(eqx.Module):
     """A fine `mesh`, the `operator` from coarse to fine, and the `creases` left over.
 
     `mesh.vertices` = operator @ coarse vertices. With `creases` the mesh can be
-    subdivided further: n levels at once and one after another are the same.
+    subdivided further: n levels at once and one after another give the same faces in
+    the same order, but new vertices may be numbered differently.
     """
 
     mesh: AnyMesh

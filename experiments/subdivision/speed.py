@@ -1,0 +1,93 @@
+"""Loop's scheme twice on an icosphere: planning and applying, against the peers.
+
+    python experiments/subdivision/speed.py
+
+Needs igl, open3d and trimesh. All tools take turns in every repetition; medians.
+"""
+
+import os
+import statistics
+import time
+
+import igl
+import jax
+import numpy as np
+import open3d
+import trimesh
+
+import jaxgeom
+from jaxgeom.meshes import icosphere
+from jaxgeom.subdivision import CatmullClark, Loop, Warren, limit, plan_subdivision
+
+REPEATS = 25
+
+
+def timed(function):
+    start = time.perf_counter()
+    jax.block_until_ready(function())
+    return 1e3 * (time.perf_counter() - start)
+
+
+def legacy(vertices, faces):
+    return open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(faces)
+    )
+
+
+def cases(mesh):
+    """Named functions that each do the work once."""
+    v, f = np.float64(mesh.vertices), np.int64(mesh.faces)
+    source = legacy(v, f)
+    loop = Loop(Warren())
+    plan = plan_subdivision(mesh, 2, scheme=loop)
+    merged = plan.operator.merged()
+    apply = jax.jit(lambda s, x: s @ x)
+    gradient = jax.jit(jax.grad(lambda x, s: ((s @ x) ** 2).sum()))
+    x = jax.numpy.asarray(mesh.vertices)
+    many = jax.numpy.stack([x] * 16, axis=1)
+    matrix = merged.to_scipy().astype(x.dtype)
+
+    def both():
+        planned = plan_subdivision(mesh, 2, scheme=loop)
+        return apply(planned.operator, x)
+
+    return {
+        "jaxgeom plan": lambda: plan_subdivision(mesh, 2, scheme=loop),
+        "jaxgeom S @ V": lambda: apply(plan.operator, x),
+        "jaxgeom plan + S @ V": both,
+        "igl.loop": lambda: igl.loop(v, f, 2),
+        "trimesh subdivide_loop": lambda: trimesh.remesh.subdivide_loop(v, f, 2),
+        "open3d subdivide_loop": lambda: source.subdivide_loop(2),
+        "jaxgeom S @ V, merged S": lambda: apply(merged, x),
+        "scipy csr @ V": lambda: matrix @ np.asarray(x),
+        "jaxgeom gradient": lambda: gradient(x, plan.operator),
+        "jaxgeom S @ V, 16 shapes": lambda: apply(plan.operator, many),
+        "jaxgeom plan, Catmull-Clark": lambda: plan_subdivision(
+            mesh, 2, scheme=CatmullClark()
+        ),
+        "jaxgeom limit": lambda: limit(mesh, scheme=loop),
+    }
+
+
+def main():
+    mesh = icosphere(4)
+    work = cases(mesh)
+    for function in work.values():
+        timed(function)
+        timed(function)
+    times = {name: [] for name in work}
+    for _ in range(REPEATS):
+        for name, function in work.items():
+            times[name].append(timed(function))
+    print(f"jaxgeom {jaxgeom.__version__}, {mesh.faces.shape[0]} faces, load", end=" ")
+    print(round(os.getloadavg()[0], 1))
+    base = statistics.median(times["jaxgeom plan + S @ V"])
+    for name, each in times.items():
+        middle = statistics.median(each)
+        print(
+            f"{name:30s} {middle:8.2f} ms  x {middle / base:6.2f}  min {min(each):.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()
