@@ -24,6 +24,10 @@ class PolygonMesh(eqx.Module):
     Raises `GeometryError` for arrays whose shapes do not agree, for two arrays of the
     same k and for indices outside of 0 ... v - 1 (these are checked where the faces are
     known, that is not inside jit).
+
+    >>> square = PolygonMesh(np.eye(4, 3), np.array([[0, 1, 2, 3]]))
+    >>> square.triangulate().faces.tolist()
+    [[0, 1, 2], [0, 2, 3]]
     """
 
     vertices: Float[Array, "v 3"]

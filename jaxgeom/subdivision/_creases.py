@@ -26,6 +26,9 @@ class Creases(eqx.Module):
 
     Raises `GeometryError` for shapes that do not agree and for negative or undefined
     sharpness.
+
+    >>> Creases([(0, 1), (1, 2)], 2.5).sharpness.tolist()
+    [2.5, 2.5]
     """
 
     edges: Int[Array, "c 2"]

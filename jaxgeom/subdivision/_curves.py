@@ -3,8 +3,9 @@
 import abc
 
 import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy import sparse
 from scipy.interpolate import BSpline
 
@@ -126,12 +127,12 @@ def curve_limit(
 
 
 def subdivide_curve(
-    points: Float[Array, "n ..."],
+    points: Float[jax.Array, "n ..."],
     levels: int = 1,
     *,
     scheme: AbstractCurveScheme = CHAIKIN,
     ends: AbstractEnds = CLOSED,
-) -> Float[Array, "m ..."]:
+) -> Float[jax.Array, "m ..."]:
     """The control polygon `points` after `levels` levels of refinement.
 
     x_fine = S x, S being `curve_refinement`, for points of any dimension.
@@ -140,6 +141,10 @@ def subdivide_curve(
     `ends`: `Closed()`, `KeptEnds()`, `FreeEnds()`.
 
     Raises `GeometryError` as `curve_refinement`.
+
+    >>> square = jax.numpy.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [0.0, 4.0]])
+    >>> subdivide_curve(square)[:2].tolist()
+    [[1.0, 0.0], [3.0, 0.0]]
     """
     n = points.shape[0]
     return curve_refinement(n, levels, scheme=scheme, ends=ends) @ points

@@ -9,7 +9,7 @@ from .._core import GeometryError, message, safe_normalize
 from ._creases import Creases, with_creases
 from ._limit_rows import neighborhoods, position_band, tangent_bands
 from ._masks import AbstractMasks, CatmullClarkMasks, LoopMasks
-from ._net import Net, grouped, net_of
+from ._net import Net, check_room, grouped, net_of
 from ._operator import Refinement, Rows, on_device
 from ._rings import Sectors, sectors_of
 from ._schemes import AbstractScheme, CatmullClark, Loop
@@ -58,7 +58,8 @@ def limit(
 
     Where faces are not quadrilaterals (Catmull-Clark) or creases are semi-sharp the
     mesh is refined until they are gone, ceil(sharpness) levels: four times the faces
-    for each, but only rows of the vertices of `mesh` are kept.
+    for each, but only rows of the vertices of `mesh` are kept. A crease meant to stay
+    should have a sharpness of `numpy.inf`.
 
     At a fixed vertex between two sharp edges the tangents are these edges. With more
     than 2 (Loop: 3) faces between them, or with less than two sharp edges, the
@@ -69,12 +70,19 @@ def limit(
     schemes other than `Loop` and `CatmullClark`.
 
     Source: M. Halstead, M. Kass, T. DeRose, 1993 (Catmull-Clark); H. Hoppe et al.,
-    1994 (Loop); H. Biermann, A. Levin, D. Zorin, 2000 (borders).
+    1994 (Loop). The tangents across borders and creases are those of the unmodified
+    rules; Biermann et al. give those of their modified ones.
+
+    >>> from jaxgeom.meshes import icosphere
+    >>> limits = limit(icosphere(1))
+    >>> limits.normals(icosphere(1).vertices).shape
+    (42, 3)
     """
     masks = _masks_of(scheme)
     net = with_creases(net_of(exact(mesh)), creases)
     factors, corner = (), np.arange(net.corners.size)
     fine, v = net, net.num_vertices
+    check_room(net, _levels_until_settled(net))
     while not _is_simple(fine, masks):
         step, finer = scheme.step(fine)
         factors, corner = factors + step, masks.tip(corner)
@@ -90,6 +98,12 @@ def limit(
     vertices = around.vertex[:count]
     parts = (chain(position), chain(first), chain(second), vertices, corners)
     return Limit(*on_device(parts))
+
+
+def _levels_until_settled(net: Net) -> int:
+    """How long the most sharp edge or vertex lasts."""
+    values = np.concatenate([net.sharpness, net.pins])
+    return int(np.ceil(np.max(values, where=np.isfinite(values), initial=0)))
 
 
 def _is_simple(net: Net, masks: AbstractMasks) -> bool:

@@ -97,6 +97,15 @@ def grouped(values, sizes) -> tuple[np.ndarray, ...]:
     return tuple(values[at == k].reshape(-1, k) for k in kinds[np.argsort(first)])
 
 
+def check_room(net: Net, levels: int) -> None:
+    """Raise `GeometryError` where int32 cannot number the corners `levels` later."""
+    corners = net.corners.size * 4**levels
+    if corners > np.iinfo(np.int32).max:
+        must = f"a mesh must have less than 2^31 corners after {levels} levels"
+        fix = "Use fewer levels; for creases that stay use a sharpness of numpy.inf."
+        raise GeometryError(message(must, f"{corners}", fix))
+
+
 def split_triangles(net: Net) -> Net:
     """Every triangle in four: new vertices v + edge on the edges."""
     v, e, h = net.num_vertices, net.ends.shape[1], net.corners.size

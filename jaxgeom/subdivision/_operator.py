@@ -54,6 +54,10 @@ class Refinement(eqx.Module):
 
     Build it with `plan_subdivision`, `limit` or `curve_refinement`, or from a scipy
     matrix with `Refinement.from_scipy`.
+
+    >>> swap = Refinement.from_scipy(sparse.csr_matrix([[0.0, 1.0], [1.0, 0.0]]))
+    >>> (swap @ np.array([3.0, 4.0])).tolist(), (swap @ swap).shape
+    ([4.0, 3.0], (2, 2))
     """
 
     factors: tuple[Rows, ...]

@@ -7,7 +7,7 @@ from jaxtyping import Array, Int
 from .._core import GeometryError, message
 from ..shapes import PolygonMesh, TriangleMesh
 from ._creases import Creases, creases_of, with_creases
-from ._net import Net, faces_of, net_of
+from ._net import Net, check_room, faces_of, net_of
 from ._operator import Refinement, Rows, identity_band, on_device
 from ._schemes import AbstractScheme, Loop
 
@@ -75,6 +75,7 @@ def plan_subdivision(
         must = "levels must be at least 0"
         raise GeometryError(message(must, f"{levels}", "Pass a whole number."))
     net = with_creases(net_of(exact(mesh)), creases)
+    check_room(net, levels)
     triangles = isinstance(mesh, TriangleMesh)
     factors, net = refine(net, levels, scheme)
     faces = faces_of(net)
@@ -106,8 +107,8 @@ def subdivide(
     - `creases`: sharp edges and vertices; the border is always sharp.
 
     Raises `GeometryError` for a mesh without faces, indices out of range, a face that
-    names a vertex twice, an edge of more than two faces, faces the scheme cannot take
-    and creases that are not edges of the mesh.
+    names a vertex twice, an edge of more than two faces, faces the scheme cannot take,
+    creases that are not edges of the mesh, and more than 2^31 corners.
 
     >>> from jaxgeom.meshes import icosphere
     >>> subdivide(icosphere(1), 2).mesh.faces.shape

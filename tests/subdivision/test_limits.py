@@ -21,7 +21,6 @@ from .meshes_for_tests import (
     cube,
     faces_of,
     follow,
-    gap,
     house,
     hull,
     refined,
@@ -216,6 +215,8 @@ def test_derivatives_reach_the_vertices(x64):
 def test_limits_that_do_not_exist_are_errors():
     with pytest.raises(GeometryError, match="known for Loop and CatmullClark"):
         limit(hull(), scheme=Midpoint())
+    with pytest.raises(GeometryError, match="less than 2.31 corners after 13 levels"):
+        limit(hull(), creases=crease_at(6, 3, 12.5)[1])
     twisted = np.array(hull().faces)
     twisted[0] = twisted[0][::-1]
     with pytest.raises(GeometryError, match="opposite directions"):
@@ -226,4 +227,3 @@ def test_limits_that_do_not_exist_are_errors():
     with pytest.raises(GeometryError, match="must be one fan"):
         limit(touching)
     assert limit(touching, creases=Creases(vertices=[0])).position.shape == (7, 7)
-    assert gap(np.zeros((2, 3)), np.zeros((2, 3))) == 0

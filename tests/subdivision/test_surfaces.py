@@ -284,5 +284,7 @@ def test_bad_settings_are_errors():
         subdivide(hull(), -1)
     with pytest.raises(GeometryError, match="Loop's scheme needs faces of three"):
         subdivide(cube(), 1, scheme=Loop())
+    with pytest.raises(GeometryError, match="less than 2.31 corners after 13 levels"):
+        subdivide(hull(), 13)
     with pytest.raises(GeometryError, match="the faces must be known"):
         jax.jit(subdivide)(hull())
