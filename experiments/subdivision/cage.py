@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxgeom import PointCloud, TriangleMesh, io, reconstruct, render
+from jaxgeom import RESULTS, PointCloud, TriangleMesh, io, reconstruct, render
 from jaxgeom.meshes import vertex_normals
 from jaxgeom.subdivision import fit_control_mesh
 
@@ -35,7 +35,7 @@ def scan(name):
 
 
 def flat(mesh):
-    """The mesh with corners of its own for every face, and its edges darker."""
+    """The mesh with corners of its own for every face, for flat shading."""
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -48,22 +48,34 @@ def report(name, fit, seconds):
     last = int(fit.steps)
     print(f"{name}: cage {fit.cage.vertices.shape[0]} vertices,", end=" ")
     print(f"{fit.cage.faces.shape[0]} faces; {last} steps, {seconds:.1f} s")
-    print(f"  rms / diagonal {rms[0]:.2e} -> {rms[last]:.2e}", fit.result)
+    print(f"  rms / diagonal {rms[0]:.2e} -> {rms[last]:.2e}", _word(fit.result))
+
+
+def _word(result):
+    return "converged" if result == RESULTS.successful else "stopped at max_steps"
+
+
+def fits(name, resolution):
+    """The fits of one scan, by smoothness."""
+    cloud = scan(name)
+    cage = reconstruct(cloud, resolution=resolution).mesh
+    found = {}
+    for smoothness in (1e-2, 1e-3, 1e-4):
+        start = time.perf_counter()
+        fit = fit_control_mesh(cloud, cage, smoothness=smoothness)
+        jax.block_until_ready(fit.rms)
+        report(f"{name}, smoothness {smoothness:g}", fit, time.perf_counter() - start)
+        found[smoothness] = fit
+    return cloud, found
 
 
 def main(path):
-    cloud = scan("horse")
-    cage = reconstruct(cloud, resolution=RESOLUTION).mesh
-    for smoothness in (1e-2, 1e-3, 1e-4):
-        start = time.perf_counter()
-        fit = fit_control_mesh(cloud, cage, levels=2, smoothness=smoothness)
-        jax.block_until_ready(fit.rms)
-        report(f"smoothness {smoothness:g}", fit, time.perf_counter() - start)
-        if smoothness == 1e-3:
-            best = fit
+    fits("bunny", 16)
+    cloud, found = fits("horse", 24)
+    best = found[1e-3]
     camera = render.Camera(jnp.array([1.7, 0.5, 0.3]), jnp.zeros(3))
     pictures = [
-        render.render_cloud(cloud, camera, size=SIZE),
+        render.render_cloud(cloud, camera, size=SIZE, radius=0.004),
         render.render_mesh(flat(best.cage), camera, size=SIZE),
         render.render_mesh(best.surface, camera, size=SIZE),
     ]

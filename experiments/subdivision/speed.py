@@ -1,6 +1,6 @@
 """Loop's scheme twice on an icosphere: planning and applying, against the peers.
 
-    python experiments/subdivision/speed.py
+    [JAX_ENABLE_X64=1] python experiments/subdivision/speed.py
 
 Needs igl, open3d and trimesh. All tools take turns in every repetition; medians.
 """
@@ -36,7 +36,7 @@ def legacy(vertices, faces):
 
 def cases(mesh):
     """Named functions that each do the work once."""
-    v, f = np.float64(mesh.vertices), np.int64(mesh.faces)
+    v, f = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
     source = legacy(v, f)
     loop = Loop(Warren())
     plan = plan_subdivision(mesh, 2, scheme=loop)
