@@ -61,10 +61,11 @@ def limit(
     for each, but only rows of the vertices of `mesh` are kept. A crease meant to stay
     should have a sharpness of `numpy.inf`.
 
-    At a fixed vertex between two sharp edges the tangents are these edges. With more
-    than 2 (Loop: 3) faces between them, or with less than two sharp edges, the
-    published corner rule has a cone or a cusp instead of a tangent plane (Biermann,
-    Levin, Zorin 2000), and the normal is only a guess.
+    Tangents are those of the published rules, which have no tangent plane everywhere:
+    with more than 3 (Loop: 5) faces between the two sharp edges of a border or crease,
+    and at fixed vertices with more than 2 (Loop: 3) faces between sharp edges, or with
+    less than two of these (cones), the normal is that of the plane through the first
+    tangents, not the limit of the normals of the faces (Biermann, Levin, Zorin 2000).
 
     Raises `GeometryError` as `subdivide` does, for inconsistent orientation, and for
     schemes other than `Loop` and `CatmullClark`.
