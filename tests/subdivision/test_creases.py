@@ -16,7 +16,19 @@ from jaxgeom.subdivision import (
     subdivide_curve,
 )
 
-from .meshes_for_tests import cube, edges_of, gap, hull, refined, ring, valence
+from .meshes_for_tests import (
+    cube,
+    edges_of,
+    faces_of,
+    gap,
+    house,
+    hull,
+    refined,
+    ring,
+    sheet,
+    valence,
+)
+from .plain_catmull_clark import level
 
 TOP = np.array([(1, 3), (3, 7), (7, 5), (5, 1)])
 SCHEMES = pytest.mark.parametrize(
@@ -158,3 +170,23 @@ def test_edges_of_the_cube_are_all_there():
         cube(), 1, scheme=CatmullClark(), creases=Creases(edges, 3.0)
     ).creases
     assert len(left.edges) == 24 and np.all(left.sharpness == 2.0)
+
+
+@pytest.mark.parametrize("mesh", [house, sheet], ids=["closed", "border"])
+def test_all_sharpness_against_a_plain_program(x64, mesh):
+    generator = np.random.default_rng(4)
+    edges = edges_of(mesh())
+    for _ in range(4):
+        some = generator.random(len(edges)) < 0.6
+        s = generator.choice([0.2, 0.7, 1.0, 1.6, 2.3, np.inf], some.sum())
+        pins, t = generator.choice(9, 3, replace=False), np.array([0.4, 1.3, np.inf])
+        vertices, _, _, _ = refined(
+            mesh(), 3, CatmullClark(), Creases(edges[some], s, pins, t)
+        )
+        points = dict(enumerate(np.asarray(mesh().vertices)))
+        faces = [tuple(face) for group in faces_of(mesh()) for face in group.tolist()]
+        sharp = dict(zip(map(frozenset, edges[some].tolist()), s, strict=True))
+        state = points, faces, sharp, dict(zip(pins.tolist(), t, strict=True))
+        for _ in range(3):
+            state = level(*state)
+        assert gap(vertices, np.array(list(state[0].values()))) < 1e-14

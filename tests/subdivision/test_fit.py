@@ -4,9 +4,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgeom import RESULTS, GeometryError, PointCloud
+from jaxgeom import RESULTS, GeometryError, PointCloud, PolygonMesh
 from jaxgeom.meshes import icosphere
-from jaxgeom.subdivision import Loop, fit_control_mesh, limit, subdivide
+from jaxgeom.subdivision import (
+    CatmullClark,
+    Creases,
+    Loop,
+    fit_control_mesh,
+    limit,
+    subdivide,
+)
 
 AXES = np.array([1.3, 0.9, 0.7])
 
@@ -68,3 +75,37 @@ def test_bad_settings_are_errors():
             fit(egg(), **{name: -1.0})
     with pytest.raises(GeometryError, match="max_steps must be at least 1"):
         fit(egg(), max_steps=0)
+
+
+def tin(n=600):
+    """Points on a closed cylinder of radius 1 and height 1.6."""
+    generator = np.random.default_rng(1)
+    angle, height = 2 * np.pi * generator.random(n), generator.uniform(-0.8, 0.8, n)
+    side = np.stack([np.cos(angle), np.sin(angle), height], -1)
+    lids = side * np.sqrt(generator.random(n))[:, None]
+    lids[:, 2] = np.where(np.arange(n) % 2, 0.8, -0.8)
+    return np.float32(np.concatenate([side, lids]))
+
+
+def drum(sides=8):
+    """A prism around the cylinder, with its two rims as creases."""
+    angle = 2 * np.pi * np.arange(sides) / sides
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    i, j = np.arange(sides), (np.arange(sides) + 1) % sides
+    up = [0, 0, 0.7]
+    walls = np.stack([i, j, j + sides, i + sides], -1)
+    lids = np.stack([i[::-1], i + sides])
+    rims = np.concatenate([np.stack([i, j], -1), np.stack([i, j], -1) + sides])
+    return PolygonMesh(np.concatenate([ring - up, ring + up]), (walls, lids)), rims
+
+
+@pytest.mark.slow
+def test_creases_let_a_cage_fit_sharp_rims():
+    cage, rims = drum()
+    settings = {"scheme": CatmullClark(), "smoothness": 1e-5}
+    sharp = fit_control_mesh(tin(), cage, creases=Creases(rims), **settings)
+    smooth = fit_control_mesh(tin(), cage, **settings)
+    last = lambda out: float(out.rms[-1])
+    assert isinstance(sharp.cage, PolygonMesh)
+    assert sharp.rms[0] > 0.05 and last(sharp) < 0.01
+    assert last(smooth) > 3 * last(sharp)
