@@ -45,6 +45,8 @@ def cases(mesh):
     gradient = jax.jit(jax.grad(lambda x, s: ((s @ x) ** 2).sum()))
     x = jax.numpy.asarray(mesh.vertices)
     many = jax.numpy.stack([x] * 16, axis=1)
+    batch = jax.numpy.stack([x] * 16)
+    mapped = jax.jit(jax.vmap(lambda s, x: s @ x, in_axes=(None, 0)))
     matrix = merged.to_scipy().astype(x.dtype)
 
     def both():
@@ -61,7 +63,8 @@ def cases(mesh):
         "jaxgeom S @ V, merged S": lambda: apply(merged, x),
         "scipy csr @ V": lambda: matrix @ np.asarray(x),
         "jaxgeom gradient": lambda: gradient(x, plan.operator),
-        "jaxgeom S @ V, 16 shapes": lambda: apply(plan.operator, many),
+        "jaxgeom S @ [v, 16, 3]": lambda: apply(plan.operator, many),
+        "jaxgeom S @ V, vmap of 16": lambda: mapped(plan.operator, batch),
         "jaxgeom plan, Catmull-Clark": lambda: plan_subdivision(
             mesh, 2, scheme=CatmullClark()
         ),

@@ -51,6 +51,7 @@ class Refinement(eqx.Module):
     two for each level. Its weights depend on the connectivity alone, so that `S @ x`
     is jitted, batched and differentiated like any matrix product; it works in the
     precision of x (integers are taken to the default float). `S @ T` applies T first.
+    Many shapes are fastest as one attribute [v, b, 3]; `jax.vmap` works as well.
 
     Build it with `plan_subdivision`, `limit` or `curve_refinement`, or from a scipy
     matrix with `Refinement.from_scipy`.

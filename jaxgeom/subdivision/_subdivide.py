@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import numpy as np
 from jaxtyping import Array, Int
 
 from .._core import GeometryError, message
@@ -22,6 +23,7 @@ class SubdivisionPlan(eqx.Module):
       first vertices are the coarse ones.
     - `faces`: int32 [f, 3] or [f, k] of the fine mesh, in a tuple by k.
     - `creases`: what is still sharp after the last level.
+    - `triangles`: the fine mesh is a `TriangleMesh`, not a `PolygonMesh`.
     """
 
     operator: Refinement
@@ -29,11 +31,11 @@ class SubdivisionPlan(eqx.Module):
     creases: Creases
     triangles: bool = eqx.field(static=True)
 
-    def __call__(self, mesh: AnyMesh) -> "TriangleMesh | PolygonMesh":
+    def __call__(self, mesh: AnyMesh) -> AnyMesh:
         """The fine mesh of a coarse one of the planned connectivity.
 
-        Vertices and attributes are refined alike; normals are left out. Survives jit,
-        vmap over the vertices, and gradients.
+        Vertices and attributes are refined alike, without padding; normals are left
+        out. Survives jit, vmap over the vertices, and gradients.
         """
         finer = lambda x: self.operator @ x[: self.operator.shape[1]]
         vertices = finer(mesh.vertices)
@@ -76,13 +78,10 @@ def plan_subdivision(
         raise GeometryError(message(must, f"{levels}", "Pass a whole number."))
     net = with_creases(net_of(exact(mesh)), creases)
     check_room(net, levels)
-    triangles = isinstance(mesh, TriangleMesh)
     factors, net = refine(net, levels, scheme)
-    faces = faces_of(net)
-    plan = SubdivisionPlan(Refinement(factors), faces, creases_of(net), False)
-    moved = on_device((plan.operator, plan.faces))
-    only_triangles = triangles and all(face.shape[1] == 3 for face in faces)
-    return SubdivisionPlan(*moved, plan.creases, only_triangles)
+    parts = on_device((Refinement(factors), faces_of(net)))
+    stays = isinstance(mesh, TriangleMesh) and bool(np.all(net.sizes == 3))
+    return SubdivisionPlan(*parts, creases_of(net), stays)
 
 
 def subdivide(
