@@ -1,12 +1,14 @@
 """Loop's scheme twice on an icosphere: planning and applying, against the peers.
 
-    [JAX_ENABLE_X64=1] python experiments/subdivision/speed.py
+    [JAX_ENABLE_X64=1] python experiments/subdivision/speed.py [MESH.ply]
 
-Needs igl, open3d and trimesh. All tools take turns in every repetition; medians.
+With a PLY file as argument: the scheme once on that mesh. Needs igl, open3d and
+trimesh. All tools take turns in every repetition; medians.
 """
 
 import os
 import statistics
+import sys
 import time
 
 import igl
@@ -16,6 +18,7 @@ import open3d
 import trimesh
 
 import jaxgeom
+from jaxgeom import io
 from jaxgeom.meshes import icosphere
 from jaxgeom.subdivision import CatmullClark, Loop, Warren, limit, plan_subdivision
 
@@ -34,12 +37,12 @@ def legacy(vertices, faces):
     )
 
 
-def cases(mesh):
+def cases(mesh, levels):
     """Named functions that each do the work once."""
     v, f = np.array(mesh.vertices, float), np.array(mesh.faces, np.int64)
     source = legacy(v, f)
     loop = Loop(Warren())
-    plan = plan_subdivision(mesh, 2, scheme=loop)
+    plan = plan_subdivision(mesh, levels, scheme=loop)
     merged = plan.operator.merged()
     apply = jax.jit(lambda s, x: s @ x)
     gradient = jax.jit(jax.grad(lambda x, s: ((s @ x) ** 2).sum()))
@@ -50,36 +53,36 @@ def cases(mesh):
     matrix = merged.to_scipy().astype(x.dtype)
 
     def both():
-        planned = plan_subdivision(mesh, 2, scheme=loop)
+        planned = plan_subdivision(mesh, levels, scheme=loop)
         return apply(planned.operator, x)
 
     return {
-        "jaxgeom plan": lambda: plan_subdivision(mesh, 2, scheme=loop),
+        "jaxgeom plan": lambda: plan_subdivision(mesh, levels, scheme=loop),
         "jaxgeom S @ V": lambda: apply(plan.operator, x),
         "jaxgeom plan + S @ V": both,
-        "igl.loop": lambda: igl.loop(v, f, 2),
-        "trimesh subdivide_loop": lambda: trimesh.remesh.subdivide_loop(v, f, 2),
-        "open3d subdivide_loop": lambda: source.subdivide_loop(2),
+        "igl.loop": lambda: igl.loop(v, f, levels),
+        "trimesh subdivide_loop": lambda: trimesh.remesh.subdivide_loop(v, f, levels),
+        "open3d subdivide_loop": lambda: source.subdivide_loop(levels),
         "jaxgeom S @ V, merged S": lambda: apply(merged, x),
         "scipy csr @ V": lambda: matrix @ np.asarray(x),
         "jaxgeom gradient": lambda: gradient(x, plan.operator),
         "jaxgeom S @ [v, 16, 3]": lambda: apply(plan.operator, many),
         "jaxgeom S @ V, vmap of 16": lambda: mapped(plan.operator, batch),
         "jaxgeom plan, Catmull-Clark": lambda: plan_subdivision(
-            mesh, 2, scheme=CatmullClark()
+            mesh, levels, scheme=CatmullClark()
         ),
         "jaxgeom limit": lambda: limit(mesh, scheme=loop),
     }
 
 
-def main():
-    mesh = icosphere(4)
-    work = cases(mesh)
+def main(path=None):
+    mesh = icosphere(4) if path is None else io.load_mesh(path)
+    work = cases(mesh, 2 if path is None else 1)
     for function in work.values():
         timed(function)
         timed(function)
     times = {name: [] for name in work}
-    for _ in range(REPEATS):
+    for _ in range(REPEATS if path is None else 5):
         for name, function in work.items():
             times[name].append(timed(function))
     print(f"jaxgeom {jaxgeom.__version__}, {mesh.faces.shape[0]} faces, load", end=" ")
@@ -93,4 +96,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])
