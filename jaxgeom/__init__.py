@@ -21,6 +21,7 @@ _ROOMS = (
     "registration",
     "render",
     "shapes",
+    "subdivision",
     "transforms",
 )
 _NAMES = {
@@ -29,6 +30,7 @@ _NAMES = {
     "runtime_token": "_core",
     "PointCloud": "shapes",
     "TriangleMesh": "shapes",
+    "PolygonMesh": "shapes",
     "Grid": "shapes",
     "stack": "shapes",
     "Rigid": "transforms",

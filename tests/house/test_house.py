@@ -14,7 +14,7 @@ FLOORS = [
     {"_core"},
     {"shapes", "transforms"},
     {"neighbors", "linear"},
-    {"fields", "meshes"},
+    {"fields", "meshes", "subdivision"},
     {"isosurface", "reconstruction", "registration", "normals"},
     {"pipelines"},
     {"io", "render"},
