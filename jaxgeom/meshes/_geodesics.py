@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core import (
     RESULTS,
     check_shape,
+    components,
     failure_where,
     first_failure,
     safe_divide,
@@ -19,7 +20,6 @@ from .._core import (
 from ..linear import conjugate_gradients
 from ..shapes import TriangleMesh
 from ._edge_list import VertexNeighbors, vertex_neighbors
-from ._edges import components
 from ._heat import HeatSystem, solve_heat
 from ._intrinsic import FlatFaces, flat_triangles
 from ._topology import proper_faces
