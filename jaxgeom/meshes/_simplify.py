@@ -160,7 +160,7 @@ def _uncancelled(faces, real):
     keys = (jnp.where(proper, low, last), middle, high)
     order = jnp.arange(f, dtype=jnp.int32)
     *keys, even, order = jax.lax.sort((*keys, even, order), num_keys=4)
-    start = jnp.zeros(f, bool).at[0].set(True, mode="drop")
+    start = jnp.arange(f) == 0
     for key in keys:
         start |= jnp.pad(key[1:] != key[:-1], (f > 0, 0), constant_values=True)
     group = prefix_sum(start.astype(jnp.int32)) + start - 1

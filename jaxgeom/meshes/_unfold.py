@@ -72,7 +72,8 @@ def _followed(faces, lengths, distance):
 
 
 def _take(offers, followed):
-    return offers.reshape(-1).at[followed].get(mode="fill", fill_value=jnp.inf)
+    # The last one, which is none, is there even for a mesh without faces.
+    return jnp.append(offers.reshape(-1), jnp.inf)[followed]
 
 
 def _differentiable(follow, lengths, distance, reached, max_steps):

@@ -7,11 +7,20 @@ import pytest
 
 from jaxgeom._core import RESULTS
 from jaxgeom.meshes import (
+    Heat,
+    Implicit,
     barycentric,
     boundary_vertices,
+    cluster_vertices,
     edges,
+    geodesic_distance,
     interpolate_normals,
+    mean_curvature,
+    principal_curvatures,
+    sample_poisson_disk,
     sample_surface,
+    smooth,
+    solid_properties,
     vertex_neighbors,
     vertex_normals,
 )
@@ -131,6 +140,27 @@ def test_no_edges():
     assert table.edge_list.required_edges == table.required_neighbors == 0
     assert not np.any(boundary)
     assert jax.eval_shape(edges, empty).vertices.shape == (1, 2)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda m: geodesic_distance(m, jnp.array([0])),
+        lambda m: geodesic_distance(
+            m, jnp.array([0]), Heat(vertex_neighbors(m, capacity=1))
+        ),
+        lambda m: smooth(m, Implicit(0.1)),
+        lambda m: cluster_vertices(m, 0.1),
+        lambda m: sample_poisson_disk(m, 0.1, capacity=3, key=jax.random.key(0)),
+        mean_curvature,
+        principal_curvatures,
+        solid_properties,
+    ],
+)
+def test_everything_can_be_traced_without_faces(function):
+    empty = TriangleMesh(jnp.zeros((4, 3)), jnp.zeros((0, 3), jnp.int32))
+    shapes = jax.tree.leaves(jax.eval_shape(function, empty))
+    assert all(jnp.dtype(x.dtype).itemsize <= 4 for x in shapes if hasattr(x, "dtype"))
 
 
 def shifted(mesh, key):
