@@ -202,7 +202,7 @@ def _first(face, ray):
     ]
     edges = [dot(cross(x, y), way) for x, y in ((b, c), (c, a), (a, b))]
     reach = sum(jnp.abs(x) for x in (*a, *b, *c))
-    margin = 2 * jnp.finfo(reach.dtype).eps * reach * reach
+    margin = jnp.finfo(reach.dtype).eps * reach * reach
     one_way = (edges[0] >= -margin) & (edges[1] >= -margin) & (edges[2] >= -margin)
     other = (edges[0] <= margin) & (edges[1] <= margin) & (edges[2] <= margin)
     minus = lambda x, y: [p - q for p, q in zip(x, y, strict=True)]

@@ -40,9 +40,9 @@ class Exact(AbstractWinding):
 class Hierarchical(AbstractWinding):
     """Faces nearby exactly, far groups of them by three terms of their multipoles.
 
-    A group counts as far from `beta` times its radius on: the error falls
-    about as 1 / beta^4. For inside and outside; its derivative is zero (that of an angle is that
-    of `Exact`).
+    A group counts as far from `beta` times its radius on: the error falls about as
+    1 / beta^4. For inside and outside: its derivative is taken as zero (`Exact` has
+    that of the angles).
 
     Source: G. Barill et al., Fast winding numbers for soups and clouds, 2018.
     """
