@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from .._core import GeometryError, message, safe_normalize
+from .._core import RESULTS, GeometryError, message, safe_normalize
 from ..fields import project
 from ..isosurface import Extraction
 from ..meshes import sample_surface, vertex_normals
@@ -79,7 +79,7 @@ def field_to_cloud(field, grid: Grid, num: int, *, key: Key[Array, ""]) -> Point
     """
     start = mesh_to_cloud(field_to_mesh(field, grid).mesh, num, key=key)
     found = jax.vmap(lambda p: project(field, p))(start.points)
-    arrived = found.result == type(found.result).successful
+    arrived = found.result == RESULTS.successful
     slopes = jax.vmap(jax.grad(field))(found.point)
     return PointCloud(
         found.point, safe_normalize(slopes), start.mask & arrived

@@ -116,10 +116,8 @@ def _meeting(triangle, origin, way):
     t = safe_divide(normal @ (a - origin), normal @ way)
     # Behind the origin by rounding only; the derivative is that of the plane.
     t = t + jax.lax.stop_gradient(jnp.maximum(t, 0) - t)
-    to_a, to_b, to_c = (x - origin for x in triangle)
-    shares = [
-        jnp.cross(x, y) @ way for x, y in ((to_b, to_c), (to_c, to_a), (to_a, to_b))
-    ]
+    sides = ((b, c - b), (c, a - c), (a, b - a))
+    shares = [jnp.cross(x - origin, side) @ way for x, side in sides]
     total = shares[0] + shares[1] + shares[2]
     barycentric = jnp.stack([safe_divide(x, total) for x in shares])
     # The margin of the test: outside by rounding is on the border.
@@ -200,17 +198,19 @@ def _first(face, ray):
         x[2] * y[0] - x[0] * y[2],
         x[0] * y[1] - x[1] * y[0],
     ]
-    edges = [dot(cross(x, y), way) for x, y in ((b, c), (c, a), (a, b))]
-    reach = sum(jnp.abs(x) for x in (*a, *b, *c))
-    margin = jnp.finfo(reach.dtype).eps * reach * reach
+    minus = lambda x, y: [p - q for p, q in zip(x, y, strict=True)]
+    ab, bc, ca = minus(b, a), minus(c, b), minus(a, c)
+    edges = [dot(cross(x, y), way) for x, y in ((b, bc), (c, ca), (a, ab))]
+    # At least six times the rounding error of a product of place, edge and way.
+    size = lambda *vectors: sum(jnp.abs(x) for vector in vectors for x in vector)
+    margin = jnp.finfo(a[0].dtype).eps * size(a, b, c) * size(ab, bc, ca)
     one_way = (edges[0] >= -margin) & (edges[1] >= -margin) & (edges[2] >= -margin)
     other = (edges[0] <= margin) & (edges[1] <= margin) & (edges[2] <= margin)
-    minus = lambda x, y: [p - q for p, q in zip(x, y, strict=True)]
-    normal = cross(minus(b, a), minus(c, a))
+    normal = cross(ab, bc)
     slope = dot(normal, way)
     length = jnp.sqrt(dot(normal, normal))
     # A face seen from the edge: its neighbors are hit instead.
-    solid = jnp.abs(slope) > 4 * jnp.finfo(reach.dtype).eps * length
+    solid = jnp.abs(slope) > 4 * jnp.finfo(length.dtype).eps * length
     t = dot(normal, a) / jnp.where(solid, slope, 1)
     t = jnp.where(jnp.abs(t) <= ray[_SLACK], jnp.abs(t), t)
     return jnp.where((one_way | other) & solid & (t >= 0), t, jnp.inf)
