@@ -16,9 +16,9 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ._tree import Tree, next_node
 
-# Queries of a packet, packets of a tile, steps down for every leaf, rounds to a refill.
+# Queries of a packet, queries of a tile, steps down for every leaf, rounds to a refill.
 _WIDTH = 16
-_TILE = 256
+_TILE = 4096
 _DESCENTS = 3
 _ROUNDS = 8
 
@@ -69,16 +69,19 @@ def walk(
     queries: Float[Array, "q c"],
     order: Int[Array, " q"],
     start: PyTree[Array],
+    *,
+    width: int = _WIDTH,
 ):
     """The states [q] after every query has walked the tree of `visit`.
 
-    `order` lists the queries along a curve, `start` holds a state [q] for each.
+    `order` lists the queries along a curve, `start` holds a state [q] for each; `width`
+    of them make a packet.
     """
     q = queries.shape[0]
-    count = -(-q // _WIDTH)
+    count = -(-q // width)
     # The last packet is filled up with its last query.
-    place = jnp.minimum(jnp.arange(count * _WIDTH), q - 1)
-    packed = lambda x: x[order[place]].reshape(count, _WIDTH, *x.shape[1:])
+    place = jnp.minimum(jnp.arange(count * width), q - 1)
+    packed = lambda x: x[order[place]].reshape(count, width, *x.shape[1:])
     waiting = jnp.swapaxes(packed(queries), 1, 2)
     fresh = jax.tree.map(packed, start)
     final = _walk_all(visit, waiting, fresh)
@@ -89,7 +92,7 @@ def walk(
 def _walk_all(visit, waiting, fresh):
     """The states of all packets at the end, [packets, p]."""
     count = waiting.shape[0]
-    tile = min(_TILE, count)
+    tile = min(_TILE // waiting.shape[2], count)
     pick = lambda x, rows: x.at[rows].get(mode="promise_in_bounds")
     idle = jnp.zeros(tile, jnp.int32)
     blank = jax.tree.map(lambda x: x[:tile], (waiting, fresh))

@@ -12,6 +12,8 @@ from ._morton import curve
 from ._packets import AbstractVisit, walk
 from ._surface import SurfaceIndex, index_surface
 
+# Rays part sooner than points: fewer to a packet.
+_WIDTH = 8
 # Channels of a ray: origin, direction, one over it, slack.
 _ORIGIN, _WAY, _OVER, _SLACK = slice(0, 3), slice(3, 6), slice(6, 9), 9
 
@@ -138,7 +140,8 @@ def _first_faces(index, rays, live):
     visit = RayVisit(index.visit.inner, rows)
     blank = jnp.full(q, leaves, jnp.int32)
     start = jnp.where(live, jnp.inf, -jnp.inf).astype(rays.dtype)
-    state = walk(visit, queries, _together(queries, live), (start, start, blank, blank))
+    order = _together(queries, live)
+    state = walk(visit, queries, order, (start, start, blank, blank), width=_WIDTH)
     best, seen, leaf, last = state
     leaf = jnp.where(best < seen, last, leaf)
     slots = leaf[:, None] * tree.leaf + jnp.arange(tree.leaf)
