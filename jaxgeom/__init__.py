@@ -23,6 +23,7 @@ _ROOMS = (
     "registration",
     "render",
     "shapes",
+    "subdivision",
     "transforms",
 )
 _NAMES = {
@@ -31,6 +32,7 @@ _NAMES = {
     "runtime_token": "_core",
     "PointCloud": "shapes",
     "TriangleMesh": "shapes",
+    "PolygonMesh": "shapes",
     "Grid": "shapes",
     "stack": "shapes",
     "Rigid": "transforms",

@@ -77,7 +77,7 @@ def run(path):
         distances = np.asarray(distances)
         error = np.abs(np.abs(distances) - far).max() / half
         wrong = clear & ((distances < 0) != inner)
-        counts = {k: int(wrong[kinds == k].sum()) for k in np.unique(kinds)}
+        counts = {k: int(wrong[kinds == k].sum()) for k in sorted(set(kinds.tolist()))}
         deepest = far[wrong].max(initial=0) / half
         print(
             f"{name:27s} error {error:.1e}  wrong signs {counts}, up to {deepest:.1e}"

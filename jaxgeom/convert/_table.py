@@ -31,6 +31,12 @@ CONVERSIONS = (
         "mesh_to_grid", "mesh", "grid values", False, "the signed distance at the nodes"
     ),
     Conversion(
+        "mesh_to_polygons", "mesh", "polygons", True, "everything but vertex normals"
+    ),
+    Conversion(
+        "polygons_to_mesh", "polygons", "mesh", False, "faces that are plane and convex"
+    ),
+    Conversion(
         "field_to_grid", "field", "grid values", False, "the values at the nodes"
     ),
     Conversion(

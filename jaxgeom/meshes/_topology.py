@@ -4,9 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core import prefix_sum
+from .._core import components, prefix_sum
 from ..shapes import TriangleMesh
-from ._edges import EdgeRuns, components, edge_runs
+from ._edges import EdgeRuns, edge_runs
 from ._geometry import corners, doubled
 
 

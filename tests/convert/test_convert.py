@@ -7,8 +7,9 @@ import pytest
 
 from jaxgeom import GeometryError, Grid, PointCloud, TriangleMesh, convert
 from jaxgeom.fields import Sphere, Torus
-from jaxgeom.meshes import icosphere, volume
+from jaxgeom.meshes import box_mesh, icosphere, volume
 from jaxgeom.neighbors import closest_on_mesh
+from jaxgeom.shapes import PolygonMesh
 
 CENTER, SIDES = np.asarray([3.0, -1.0, 2.0]), np.asarray([1.3, 0.7, 1.1])
 
@@ -120,3 +121,18 @@ def test_field_to_mesh_of_exact_distances():
     error = float(jnp.abs(jax.vmap(body)(mesh.vertices)).max())
     # Linear interpolation of a distance of curvature 1 / r: at most h^2 / (8 r) or so.
     assert error < float(spacing[0]) ** 2 / 0.35
+
+
+def test_polygons_and_triangles():
+    mesh = _ellipsoid()
+    there = convert.mesh_to_polygons(mesh)
+    back = convert.polygons_to_mesh(there)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+    np.testing.assert_array_equal(back.vertices, mesh.vertices)
+    np.testing.assert_array_equal(back.attributes["place"], mesh.attributes["place"])
+    corners = box_mesh((1.0, 2.0, 3.0))
+    quads = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1)])
+    quads = np.concatenate([quads, [(2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]])
+    box = convert.polygons_to_mesh(PolygonMesh(corners.vertices, quads))
+    np.testing.assert_allclose(volume(box), 6, rtol=1e-6)
+    assert box.faces.shape == (12, 3)

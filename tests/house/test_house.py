@@ -14,7 +14,7 @@ FLOORS = [
     {"_core"},
     {"shapes", "transforms"},
     {"neighbors", "linear"},
-    {"fields", "meshes", "clouds"},
+    {"fields", "meshes", "subdivision", "clouds"},
     {"isosurface", "reconstruction", "registration", "normals"},
     {"pipelines", "convert"},
     {"io", "render"},
