@@ -14,9 +14,9 @@ FLOORS = [
     {"_core"},
     {"shapes", "transforms"},
     {"neighbors", "linear"},
-    {"fields", "meshes", "subdivision"},
+    {"fields", "meshes", "subdivision", "clouds"},
     {"isosurface", "reconstruction", "registration", "normals"},
-    {"pipelines"},
+    {"pipelines", "convert"},
     {"io", "render"},
     {"cli"},
 ]
