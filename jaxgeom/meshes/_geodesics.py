@@ -91,10 +91,11 @@ class Heat(AbstractGeodesics):
     3. The function whose gradient is nearest to it: L d = div X, d = 0 at the sources.
 
     A larger `smoothness` rounds off where fronts meet. Next to the sources the error is
-    10 to 20 % of the (small) distance, and triangulations far from Delaunay cost accuracy
-    everywhere (their negative weights are left out of step 1). `neighbors` is the table of `vertex_neighbors`,
-    measured on the host if left out; under jit and for many calls pass it. `rtol` and
-    `max_steps` belong to both solvers.
+    10 to 20 % of the (small) distance, and triangulations far from Delaunay cost
+    accuracy everywhere (their negative weights are left out of step 1). `neighbors` is
+    the table of `vertex_neighbors`, measured on the host if left out; under jit and for
+    many calls pass it. `rtol` and `max_steps` belong
+    to both solvers.
 
     Source: K. Crane, C. Weischedel, M. Wardetzky, Geodesics in heat, 2013.
     """
