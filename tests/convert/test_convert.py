@@ -46,6 +46,7 @@ def test_the_table_names_every_function_once():
         assert c.function.split("_to_")[1].split("_")[0] in c.target
 
 
+@pytest.mark.slow
 def test_mesh_to_grid_and_back():
     mesh, grid = _ellipsoid(), _grid(24)
     values = jax.jit(convert.mesh_to_grid)(mesh, grid)
@@ -94,6 +95,7 @@ def test_mesh_to_cloud_lies_on_the_mesh():
     assert np.sum(bare.normals * outward, axis=1).min() > 0.99
 
 
+@pytest.mark.slow
 def test_cloud_to_field_and_mesh():
     grid = _grid(24)
     cloud = convert.field_to_cloud(_body, grid, 2000, key=jax.random.key(2))

@@ -134,6 +134,7 @@ def test_gradients_are_central_differences(x64):
     np.testing.assert_allclose(exact[same], numeric[same], rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop():
     mesh, (origins, ways) = _bumpy(), _rays(60)
     index = index_surface(mesh)
