@@ -60,7 +60,9 @@ def test_many_shapes_at_once(x64):
     np.testing.assert_allclose(many, [APPLY(s, x) for x in shapes], atol=1e-14)
 
 
-@pytest.mark.parametrize("case", [(hull, Loop()), (cube, CatmullClark())], ids=str)
+@pytest.mark.parametrize(
+    "case", [(hull, Loop()), (cube, CatmullClark())], ids=["loop", "catmull-clark"]
+)
 def test_levels_compose_and_merge(x64, case):
     mesh, scheme = case[0](), case[1]
     first = plan_subdivision(mesh, 1, scheme=scheme)
