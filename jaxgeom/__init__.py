@@ -9,6 +9,8 @@ import importlib
 __version__ = "0.1.0"
 
 _ROOMS = (
+    "clouds",
+    "convert",
     "fields",
     "io",
     "isosurface",
@@ -22,6 +24,7 @@ _ROOMS = (
     "registration",
     "render",
     "shapes",
+    "subdivision",
     "transforms",
 )
 _NAMES = {
@@ -30,6 +33,7 @@ _NAMES = {
     "runtime_token": "_core",
     "PointCloud": "shapes",
     "TriangleMesh": "shapes",
+    "PolygonMesh": "shapes",
     "Grid": "shapes",
     "stack": "shapes",
     "Rigid": "transforms",

@@ -19,24 +19,33 @@ import numpy as np
 
 from jaxgeom.fields import Box, Cylinder, Torus
 from jaxgeom.isosurface import (
+    AdaptiveDualContouring,
     Cubic,
     DualContouring,
+    DualGridCubes,
     DualMarchingCubes,
+    FlexiCubes,
     MarchingCubes,
     extract,
 )
 from jaxgeom.shapes import Grid
 from jaxgeom.transforms import Rigid
 
+# Given the width of a cell: octrees merge cells up to an error of 1/20 of it.
 METHODS = {
-    "marching cubes": MarchingCubes(),
-    "marching cubes, cubic": MarchingCubes(placement=Cubic()),
-    "dual marching cubes": DualMarchingCubes(),
-    "dual contouring": DualContouring(),
+    "marching cubes": lambda width: MarchingCubes(),
+    "marching cubes, cubic": lambda width: MarchingCubes(placement=Cubic()),
+    "dual marching cubes": lambda width: DualMarchingCubes(),
+    "dual contouring": lambda width: DualContouring(),
+    "dual contouring, octree": lambda width: AdaptiveDualContouring(width / 20),
+    "dual grid": lambda width: DualGridCubes(),
+    "dual grid, octree": lambda width: DualGridCubes(width / 20, levels=4),
+    "FlexiCubes, weights zero": lambda width: FlexiCubes(),
 }
+UNIFORM = [name for name in METHODS if "octree" not in name]
 HALF = np.array([0.5, 0.42, 0.56], np.float32)
 
-PICTURED = ("marching cubes", "dual marching cubes", "dual contouring")
+PICTURED = [name for name in METHODS if name not in UNIFORM[1:2] + UNIFORM[-1:]]
 
 
 def box():
@@ -150,7 +159,7 @@ def report(name, body, grid):
         edges = edges @ (q * np.linalg.det(q)).T + np.array([0.021, -0.034, 0.013])
     slopes = jax.jit(jax.vmap(jax.value_and_grad(field)))
     for label, method in METHODS.items():
-        mesh = extract(field, grid, method=method).mesh
+        mesh = extract(field, grid, method=method(width)).mesh
         points, normals = samples(mesh)
         values, gradients = map(np.asarray, slopes(points))
         steep = np.linalg.norm(gradients, axis=1)
@@ -169,10 +178,10 @@ def report(name, body, grid):
 def convergence():
     """The largest distance from a torus, and the order from one grid to the next."""
     field = placed(Torus(0.55, 0.25))
-    for label, method in METHODS.items():
+    for label in UNIFORM:
         errors = []
         for n in (32, 63, 125):
-            mesh = extract(field, grid_of(n), method=method).mesh
+            mesh = extract(field, grid_of(n), method=METHODS[label](0)).mesh
             points = np.asarray(mesh.vertices)[np.asarray(mesh.faces)].mean(axis=1)
             errors.append(float(np.abs(jax.jit(jax.vmap(field))(points)).max()))
         orders = [np.log2(a / b) for a, b in itertools.pairwise(errors)]
@@ -187,14 +196,12 @@ def picture(path, body, resolution):
 
     field, grid = placed(body), grid_of(resolution)
     figure, axes = plt.subplots(
-        1,
-        len(PICTURED),
-        figsize=(4 * len(PICTURED), 4.4),
-        subplot_kw={"projection": "3d"},
+        2, 3, figsize=(12, 8.6), subplot_kw={"projection": "3d"}
     )
+    width = float(np.max(grid.spacing))
     light = np.array([0.4, -0.5, 0.77])
-    for axis, label in zip(axes, PICTURED, strict=True):
-        mesh = extract(field, grid, method=METHODS[label]).mesh
+    for axis, label in zip(axes.flat, PICTURED, strict=True):
+        mesh = extract(field, grid, method=METHODS[label](width)).mesh
         corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals = cross / np.linalg.norm(cross, axis=1, keepdims=True)
@@ -205,7 +212,12 @@ def picture(path, body, resolution):
                 corners, facecolors=colors, edgecolors=0.6 * colors, lw=0.2
             )
         )
-        axis.set(xlim=(-0.7, 0.7), ylim=(-0.7, 0.7), zlim=(-0.7, 0.7), title=label)
+        axis.set(
+            xlim=(-0.7, 0.7),
+            ylim=(-0.7, 0.7),
+            zlim=(-0.7, 0.7),
+            title=f"{label}: {len(corners)} faces",
+        )
         axis.set_box_aspect((1, 1, 1), zoom=1.5)
         axis.set_axis_off()
     figure.tight_layout()

@@ -3,6 +3,7 @@
 from ._checks import GeometryError as GeometryError
 from ._checks import check_shape as check_shape
 from ._checks import message as message
+from ._components import components as components
 from ._maths import prefix_sum as prefix_sum
 from ._maths import safe_divide as safe_divide
 from ._maths import safe_norm as safe_norm

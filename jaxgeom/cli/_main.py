@@ -240,9 +240,17 @@ def _add_mesh(commands):
             "marching-cubes",
             "dual-contouring",
             "dual-marching-cubes",
+            "dual-grid",
             "flexicubes",
         ),
         default="marching-cubes",
+    )
+    command.add_argument(
+        "--tolerance",
+        type=_nonnegative,
+        default=0.0,
+        metavar="T",
+        help="dual-contouring, dual-grid: larger faces, up to this error (0: none)",
     )
     command.add_argument("--level", type=_finite, default=0.0, help="of the field (0)")
     _add_bounds(command)

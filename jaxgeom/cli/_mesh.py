@@ -4,9 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import Grid
+from ..fields import NarrowBand, claims
 from ..io import save_mesh
 from ..isosurface import (
+    AdaptiveDualContouring,
     DualContouring,
+    DualGridCubes,
     DualMarchingCubes,
     FlexiCubes,
     MarchingCubes,
@@ -18,11 +21,14 @@ from ._report import Stages, say, write_report
 from ._scene import box_of, load_scene
 
 _METHODS = {
-    "marching-cubes": MarchingCubes(),
-    "dual-contouring": DualContouring(),
-    "dual-marching-cubes": DualMarchingCubes(),
-    "flexicubes": FlexiCubes(),
+    "marching-cubes": lambda t: MarchingCubes(),
+    "dual-contouring": lambda t: AdaptiveDualContouring(t) if t else DualContouring(),
+    "dual-marching-cubes": lambda t: DualMarchingCubes(),
+    "dual-grid": lambda t: DualGridCubes(t, levels=4 if t else 0),
+    "flexicubes": lambda t: FlexiCubes(),
 }
+# Nodes along an axis from which on only bricks near the surface are sampled.
+_LARGE = 256
 # Cells left free around the box, so that the surface does not touch the border.
 _MARGIN = 2
 
@@ -34,9 +40,9 @@ def run(arguments) -> int:
         field = load_scene(arguments.scene)
         low, high = box_of(field, arguments.bounds, arguments.scene)
     grid = _grid_in(low, high, arguments.resolution)
-    method = _METHODS[arguments.method]
+    method = _METHODS[arguments.method](arguments.tolerance)
     with stages.stage("extract"):
-        out = extract(field, grid, arguments.level, method=method, closed=True)
+        out = _extract(field, grid, arguments.level, method)
     if len(out.mesh.faces) == 0:
         say(f"no surface of {arguments.scene} in {_box(low, high)}")
         return CHECK
@@ -60,6 +66,15 @@ def run(arguments) -> int:
         f"{sum(stages.seconds.values()):.1f} s: {arguments.output}"
     )
     return OK if sound else CHECK
+
+
+def _extract(field, grid, level, method):
+    """The closed mesh; in bricks where the grid is large and the field allows it."""
+    bricks = isinstance(method, MarchingCubes) and max(grid.shape) >= _LARGE
+    if bricks and jnp.isfinite(claims(field).lipschitz):
+        band = NarrowBand.around(field, grid, level, closed=True)
+        return extract(band, method=method)
+    return extract(field, grid, level, method=method, closed=True)
 
 
 def _grid_in(low, high, resolution) -> Grid:

@@ -92,6 +92,8 @@ from ._profiles import RoundedRectangle as RoundedRectangle
 from ._profiles import Star as Star
 from ._profiles import Trapezoid as Trapezoid
 from ._profiles import Triangle as Triangle
+from ._pruned import PrunedSamples as PrunedSamples
+from ._pruned import sample_near_surface as sample_near_surface
 from ._queries import SurfacePoint as SurfacePoint
 from ._queries import closest_point as closest_point
 from ._queries import normal as normal

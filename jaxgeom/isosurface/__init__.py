@@ -1,5 +1,7 @@
 """From a sampled field to a mesh: one signature, one result for all extractors."""
 
+from ._adaptive import AdaptiveDualContouring as AdaptiveDualContouring
+from ._adaptive import adaptive_dual_contouring as adaptive_dual_contouring
 from ._ambiguity import AbstractFaceRule as AbstractFaceRule
 from ._ambiguity import AsymptoticDecider as AsymptoticDecider
 from ._ambiguity import SeparateInside as SeparateInside
@@ -8,6 +10,8 @@ from ._brick_cubes import marching_cubes_on_bricks as marching_cubes_on_bricks
 from ._classify import Counts as Counts
 from ._dual_contouring import DualContouring as DualContouring
 from ._dual_contouring import dual_contouring as dual_contouring
+from ._dual_grid import DualGridCubes as DualGridCubes
+from ._dual_grid import dual_grid_cubes as dual_grid_cubes
 from ._dual_marching_cubes import DualMarchingCubes as DualMarchingCubes
 from ._dual_marching_cubes import dual_marching_cubes as dual_marching_cubes
 from ._extract import extract as extract

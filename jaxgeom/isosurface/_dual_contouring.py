@@ -22,9 +22,10 @@ from ._extraction import Capacity, Extraction
 from ._hermite import CLEARANCE, Hermite, from_field, from_samples
 from ._marching_cubes import as_float, check_grid
 from ._patches import Patches, corner_indices
-from ._qef import Planes, minimize_all
+from ._qef import Planes, fit_planes, minimize
 
-_STEPS = 4
+# Tikhonov's steps of `_qef.py`.
+STEPS = 4
 
 
 class DualContouring(AbstractDualMethod):
@@ -113,34 +114,23 @@ def place_vertices(hermite: Hermite, dual: Dual, grid: Grid, weight):
     # Cells are fitted from their corner, in units of their widest side.
     scale = jnp.max(grid.spacing)
     size = grid.spacing / scale
-    planes = _planes(hermite, patches, size)
+    planes = patch_planes(hermite, patches, size)
     low, high = CLEARANCE * size, (1 - CLEARANCE) * size
-    local = minimize_all(planes, low, high, weight, _STEPS)
+    local = minimize(planes, low, high, weight, STEPS)
     corner = grid.origin + grid.spacing * corner_indices(patches.node, grid.shape)
-    held = patches.held[..., None].astype(corner.dtype)
-    normals = jnp.sum(held * hermite.normals[patches.edge], axis=0)
-    return corner + scale * local, safe_normalize(normals)
+    return corner + scale * local.T, safe_normalize(planes.direction.T)
 
 
-def _planes(hermite: Hermite, patches: Patches, size) -> Planes:
-    """The tangent planes at the crossings of every patch, about their mean."""
-    points = local_crossings(hermite.t, patches) * size
-    normals = hermite.normals[patches.edge]
-    held = patches.held[..., None].astype(points.dtype)
-    number = jnp.maximum(jnp.sum(held, axis=0), 1.0)
-    mean = jnp.sum(held * points, axis=0) / number
-    offsets = jnp.sum(normals * (points - mean), axis=-1, keepdims=True)
-    outer = normals[..., :, None] * normals[..., None, :]
-    normal = jnp.sum(held[..., None] * outer, axis=0) / number[..., None]
-    right = jnp.sum(held * normals * offsets, axis=0) / number
-    return Planes(mean, normal, right)
+def patch_planes(hermite: Hermite, patches: Patches, size) -> Planes:
+    """The planes of every patch, from the corner of its cell, which is of this size."""
+    normals = hermite.normals.T
 
+    def read(slot):
+        edge, code, held = slot
+        along, axis = hermite.t[edge], code & 3
+        corner = [(code >> (2 + d) & 1).astype(along.dtype) for d in range(3)]
+        place = [jnp.where(axis == d, along, corner[d]) * size[d] for d in range(3)]
+        return place, [n[edge] for n in normals], held.astype(along.dtype)
 
-def local_crossings(t: Float[Array, " e"], patches: Patches) -> Float[Array, "k v 3"]:
-    """The crossings of every patch in its cell, in [0, 1]^3."""
-    axis, along = patches.code & 3, t[patches.edge]
-    columns = [
-        jnp.where(axis == d, along, (patches.code >> (2 + d) & 1).astype(t.dtype))
-        for d in range(3)
-    ]
-    return jnp.stack(columns, axis=-1)
+    slots = (patches.edge, patches.code, patches.held)
+    return fit_planes(read, slots, jnp.zeros(patches.node.shape, hermite.t.dtype))

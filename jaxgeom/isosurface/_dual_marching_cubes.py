@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from .._core import safe_normalize, stage
 from ..shapes import Grid
 from ._dual import AbstractDualMethod, Dual, dual_mesh, find_dual
-from ._dual_contouring import local_crossings
+from ._dual_contouring import patch_planes
 from ._extraction import Capacity, Extraction
 from ._hermite import CLEARANCE, Hermite
 from ._marching_cubes import as_float, check_grid
@@ -95,10 +95,7 @@ def dual_marching_cubes(
 
 def _means(hermite: Hermite, dual: Dual, grid: Grid):
     """The mean crossing and the mean normal of every patch."""
-    patches = dual.patches
-    held = patches.held[..., None].astype(hermite.t.dtype)
-    number = jnp.maximum(jnp.sum(held, axis=0), 1.0)
-    local = jnp.sum(held * local_crossings(hermite.t, patches), axis=0) / number
-    corner = corner_indices(patches.node, grid.shape)
-    normals = jnp.sum(held * hermite.normals[patches.edge], axis=0)
-    return grid.origin + grid.spacing * (corner + local), safe_normalize(normals)
+    planes = patch_planes(hermite, dual.patches, jnp.ones(3, hermite.t.dtype))
+    corner = corner_indices(dual.patches.node, grid.shape) + planes.mean.T
+    normals = safe_normalize(planes.direction.T)
+    return grid.origin + grid.spacing * corner, normals

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._core import GeometryError, message, runtime_token
+from .._core import RESULTS, GeometryError, message, runtime_token
 from ..fields import NarrowBand
 from ..shapes import Grid
 from ._brick_extract import extract_band
@@ -28,7 +28,8 @@ def extract(
 ) -> Extraction:
     """The mesh of exact size where a field equals `level` (host: sizes are measured).
 
-    A cheap pass counts what is needed, the capacity is rounded up to a bucket (so that
+    A cheap pass counts what is needed (about, for some methods: then a second run may
+    follow), the capacity is rounded up to a bucket (so that
     similar surfaces share one program), the mesh is extracted and trimmed.
 
     **Arguments:**
@@ -59,6 +60,11 @@ def extract(
     sizes = (int(needed.vertices), int(needed.faces), int(needed.cells))
     capacity = Capacity.holding(*sizes)
     out = _run(method, values, grid, level, capacity, function, token)
+    if bool(out.result == RESULTS.capacity_exceeded):
+        # What is needed is known now: one more run is enough.
+        needed = out.required_vertices, out.required_faces, out.required_cells
+        capacity = Capacity.holding(*(int(n) for n in needed))
+        out = _run(method, values, grid, level, capacity, function, token)
     return eqx.tree_at(lambda e: e.mesh, out, out.mesh.trim())
 
 

@@ -67,6 +67,26 @@ class AngleWeights(AbstractNormalWeights):
         return jnp.where(real, jnp.arctan2(sine, jnp.where(real, cosine, 1)), 0)
 
 
+class SphereWeights(AbstractNormalWeights):
+    """Faces count by sin(angle) / (product of the two sides at the vertex).
+
+    Exact for vertices on a sphere, and most accurate on smooth surfaces.
+
+    Source: N. Max, Weights for computing vertex normals from facet normals, 1999.
+    """
+
+    def at_corners(self, triangles):
+        to_next = jnp.roll(triangles, -1, axis=1) - triangles
+        to_last = jnp.roll(triangles, 1, axis=1) - triangles
+        square = lambda x: jnp.sum(x * x, axis=-1)
+        # In units of the mesh: products of four lengths would underflow.
+        scale = jax.lax.stop_gradient(jnp.max(jnp.abs(to_next), initial=0))
+        scale = jnp.where(scale > 0, scale, 1)
+        to_next, to_last = to_next / scale, to_last / scale
+        sine = safe_norm(jnp.cross(to_next, to_last))
+        return safe_divide(sine, square(to_next) * square(to_last))
+
+
 class UniformWeights(AbstractNormalWeights):
     """All faces count the same."""
 
@@ -79,7 +99,8 @@ def vertex_normals(
 ) -> Float[Array, "v 3"]:
     """The unit normal of every vertex: normalize(sum over its faces of w n).
 
-    `weights` is `AreaWeights()` (the default), `AngleWeights()` or `UniformWeights()`.
+    `weights` is `AreaWeights()` (the default), `AngleWeights()`, `SphereWeights()` or
+    `UniformWeights()`.
     Zero, with gradient zero, for padding, for vertices without faces and where the
     normals of the faces cancel.
     """

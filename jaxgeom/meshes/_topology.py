@@ -4,9 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core import prefix_sum
+from .._core import components, prefix_sum
 from ..shapes import TriangleMesh
-from ._edges import EdgeRuns, components, edge_runs
+from ._edges import EdgeRuns, edge_runs
 from ._geometry import corners, doubled
 
 
@@ -70,7 +70,7 @@ def topology(mesh: TriangleMesh) -> Topology:
     of it is exact, and constant under differentiation.
     """
     v = mesh.vertices.shape[0]
-    proper = _proper(mesh)
+    proper = proper_faces(mesh)
     faces = jnp.where(proper[:, None], mesh.faces, v)
     runs = edge_runs(faces, proper, v)
     size, balance = _run_counts(runs, faces)
@@ -81,7 +81,7 @@ def topology(mesh: TriangleMesh) -> Topology:
     labels = _face_labels(runs, faces.shape[0])
     pieces = count((labels == jnp.arange(faces.shape[0])) & proper)
     loops = _boundary_loops(runs, size, v)
-    fans = _fans_per_vertex(runs, faces, v)
+    fans = fans_per_vertex(runs, faces, v)
     boundary, crowded, pinched = count(size == 1), count(size > 2), count(fans > 1)
     is_manifold = (crowded == 0) & (pinched == 0)
     is_oriented = ~jnp.any((size > 1) & (balance != 0))
@@ -96,8 +96,8 @@ def topology(mesh: TriangleMesh) -> Topology:
         boundary_loops=loops,
         nonmanifold_edges=crowded,
         nonmanifold_vertices=pinched,
-        duplicate_faces=count(_duplicates(runs)),
-        degenerate_faces=count(mesh.face_mask & (~proper | _flat(mesh))),
+        duplicate_faces=count(repeated_faces(runs)),
+        degenerate_faces=count(mesh.face_mask & (~proper | flat_faces(mesh))),
         genus=jnp.where(is_manifold & is_oriented, genus, 0),
     )
 
@@ -105,7 +105,7 @@ def topology(mesh: TriangleMesh) -> Topology:
 def face_components(mesh: TriangleMesh) -> Components:
     """The connected component of every face, across edges (not single vertices)."""
     v, f = mesh.vertices.shape[0], mesh.faces.shape[0]
-    proper = _proper(mesh)
+    proper = proper_faces(mesh)
     faces = jnp.where(proper[:, None], mesh.faces, v)
     labels = _face_labels(edge_runs(faces, proper, v), f)
     first = (labels == jnp.arange(f)) & mesh.face_mask
@@ -113,13 +113,13 @@ def face_components(mesh: TriangleMesh) -> Components:
     return Components(labels, jnp.sum(first, dtype=jnp.int32))
 
 
-def _proper(mesh):
+def proper_faces(mesh):
     """True for the real faces that name three different vertices."""
     a, b, c = (jnp.asarray(mesh.faces)[:, d] for d in range(3))
     return mesh.face_mask & (a != b) & (b != c) & (c != a)
 
 
-def _flat(mesh) -> Bool[Array, " f"]:
+def flat_faces(mesh) -> Bool[Array, " f"]:
     """True where the area is lost in the rounding of the corners."""
     triangles = corners(mesh)
     sides = triangles - jnp.roll(triangles, 1, axis=1)
@@ -163,7 +163,7 @@ def _boundary_loops(runs, size, v):
     return jnp.sum(reached.set(True, mode="drop"), dtype=jnp.int32)
 
 
-def _fans_per_vertex(runs, faces, v):
+def fans_per_vertex(runs, faces, v):
     """How many separate fans of faces each vertex has."""
     e = runs.slots.shape[0]
     start = runs.slots
@@ -179,7 +179,7 @@ def _fans_per_vertex(runs, faces, v):
     return jnp.zeros(v, jnp.int32).at[vertex].add(1, mode="drop")
 
 
-def _duplicates(runs):
+def repeated_faces(runs):
     """True where a half-edge repeats the face before it in its run.
 
     Each face is looked at along the edge of its two smaller vertices only.

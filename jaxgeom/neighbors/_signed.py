@@ -1,13 +1,16 @@
 """The signed distance of a triangle mesh, with a sign right on edges and vertices."""
 
+from abc import abstractmethod
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._core import RESULTS, safe_norm, safe_normalize
 from ..shapes import TriangleMesh
 from ._surface import ClosestPoint, closest_on_mesh
+from ._winding import AbstractWinding, Hierarchical, inside
 
 
 class SignedDistance(eqx.Module):
@@ -23,7 +26,35 @@ class SignedDistance(eqx.Module):
     result: RESULTS
 
 
-def signed_distance(mesh: TriangleMesh, points: Float[Array, "q 3"]) -> SignedDistance:
+class AbstractSign(eqx.Module):
+    """How inside is told from outside."""
+
+    @abstractmethod
+    def is_inside(self, mesh, points, height) -> Bool[Array, " q"]:
+        """Where points lie inside; `height` [q] is that over the pseudonormal."""
+
+
+class Pseudonormal(AbstractSign):
+    """The side of the faces around the closest point: for closed, clean meshes."""
+
+    def is_inside(self, mesh, points, height):
+        """Below the faces around the closest point."""
+        return height < 0
+
+
+class Winding(AbstractSign):
+    """A winding number of more than 1/2: for meshes with holes or crossing parts."""
+
+    method: AbstractWinding = Hierarchical()
+
+    def is_inside(self, mesh, points, height):
+        """Where the surface winds around the point."""
+        return inside(mesh, points, method=self.method)
+
+
+def signed_distance(
+    mesh: TriangleMesh, points: Float[Array, "q 3"], *, sign: AbstractSign | None = None
+) -> SignedDistance:
     """sign((q - c) . n(c)) |q - c|, with c the closest point of the mesh to q [q, 3].
 
     n(c) is the normal of the face where c lies inside one, the sum of the normals of
@@ -31,8 +62,15 @@ def signed_distance(mesh: TriangleMesh, points: Float[Array, "q 3"]) -> SignedDi
     the faces: with these the sign is right wherever c lies on a closed mesh that does
     not cross itself, counter-clockwise seen from outside. Faces meet where they name
     the same vertices: weld the mesh first. On an open mesh the sign tells the side of
-    the nearest face. Differentiable in points and vertices; on the surface itself the
-    gradient is n. Statuses as of `closest_on_mesh`.
+    the nearest face: `sign` is `Pseudonormal()` (the default) or `Winding()`.
+
+    Differentiable in points and vertices by the envelope theorem: c minimises the
+    distance over the surface, so that to first order only q and the three corners v_i
+    of the face move it, at fixed barycentric coordinates b_i,
+
+        d|q - c| = u . (dq - sum b_i dv_i),    u = (q - c) / |q - c|,
+
+    and on the surface itself u is n. Statuses as of `closest_on_mesh`.
 
     Source: J. A. Baerentzen, H. Aanaes, Signed distance computation using the angle
     weighted pseudonormal, 2005.
@@ -46,11 +84,13 @@ def signed_distance(mesh: TriangleMesh, points: Float[Array, "q 3"]) -> SignedDi
     washed = jnp.where(closest.mask[:, None], points, 0)
     gap = washed - jnp.einsum("qi,qid->qd", constant, triangle)
     height = jnp.sum(normals * gap, axis=-1)
-    sign = jnp.where(jax.lax.stop_gradient(height) < 0, -1, 1)
+    method = Pseudonormal() if sign is None else sign
+    below = method.is_inside(*jax.lax.stop_gradient((mesh, points, height)))
+    side = jnp.where(below, -1, 1)
     # Where the gap is rounding error it has no direction: take the normal's.
     size = jnp.maximum(jnp.max(jnp.abs(washed), -1), jnp.max(jnp.abs(triangle), (1, 2)))
     touching = closest.distances <= 4 * jnp.finfo(size.dtype).eps * size
-    away = jnp.where(touching, height, sign * closest.distances)
+    away = jnp.where(touching, height, side * closest.distances)
     return SignedDistance(away, normals, closest, closest.result)
 
 

@@ -8,11 +8,12 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core import RESULTS, check_shape, failure_where, safe_divide, safe_norm
 from ..shapes import TriangleMesh
 from ._backends import usable
+from ._closest import ClosestVisit, face_rows
 from ._morton import curve
-from ._tree import Tree, grow, search_tree
+from ._packets import child_boxes, walk
+from ._tree import Tree, grow
 
 _LEAF = 4
-_LANES = 1024
 
 
 class ClosestPoint(eqx.Module):
@@ -35,13 +36,14 @@ class SurfaceIndex(eqx.Module):
     """The faces of a mesh prepared for repeated searches.
 
     Gradients flow through `corners` [f, 3, 3]; `packed` holds them again in the order
-    of the tree, as constants.
+    of the tree, as constants, and `visit` what a search reads of them.
     """
 
     corners: Float[Array, "f 3 3"]
     mask: Bool[Array, " f"]
     tree: Tree
     packed: Float[Array, "3 3 m"]
+    visit: ClosestVisit
 
 
 def index_surface(mesh: TriangleMesh) -> SurfaceIndex:
@@ -58,11 +60,11 @@ def closest_on_mesh(
 ) -> ClosestPoint:
     """The exact closest point of the mesh to every query [q, 3].
 
-    Queries descend a tree of bounding boxes of the faces, sorted along a Morton curve;
-    pass `index_surface(mesh)` to grow it only once. Which face is nearest is a constant
-    under differentiation; given the face, the gradient of the distance is the unit
-    vector from the closest point to the query, shared among the corners by minus the
-    barycentric coordinates (the envelope theorem), and zero on the surface itself.
+    Packets of queries, sorted along a Morton curve, walk a tree of bounding boxes of
+    the faces; pass `index_surface(mesh)` to grow it only once. Which face is nearest is
+    a constant under differentiation; given the face, the gradient of the distance is
+    the unit vector from the closest point to the query, shared among the corners by
+    minus the barycentric coordinates (the envelope theorem), and zero on the surface.
 
     Source: C. Ericson, Real-Time Collision Detection, 2005, 5.1.5 (closest point).
     """
@@ -94,32 +96,27 @@ def _plant(corners, mask):
     centers = jnp.where(mask[:, None], centers, 0)
     tree = grow(curve(centers, mask), mask, low, high, _LEAF)
     packed = corners.at[tree.order].get(mode="fill", fill_value=jnp.inf)
-    return tree, jnp.moveaxis(packed, 0, -1)
+    packed = jnp.moveaxis(packed, 0, -1)
+    return tree, packed, ClosestVisit(child_boxes(tree), face_rows(packed, _LEAF))
 
 
 # Outside jit, loops would compile what they close over as constants (slowly).
 @jax.jit
 def _nearest_faces(index, queries, live):
     """The face nearest to each query; f where there is none."""
-
-    def squares(slots, points):
-        each = [[index.packed[i, d][slots] for d in range(3)] for i in range(3)]
-        return _squares(jnp.asarray(each), points[:, None])
-
-    limits = jnp.full(queries.shape[0], jnp.inf, queries.dtype)
-    queue = (curve(queries, live), jnp.sum(live))
-    near = search_tree(index.tree, queries, limits, queue, squares, k=1, lanes=_LANES)
-    return jnp.minimum(near.items[0], index.corners.shape[0])
-
-
-def _squares(corners: Float[Array, "3 3 *t"], point: Float[Array, "3 *t"]):
-    """The squared distance of points to triangles, coordinates first."""
-    a, b, c = corners
-    u, v, w = _weights(
-        a, b, c, point, lambda x, y: x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
-    )
-    gap = point - (u * a + v * b + w * c)
-    return gap[0] ** 2 + gap[1] ** 2 + gap[2] ** 2
+    tree, leaves = index.tree, index.visit.leaves.shape[0]
+    f = index.corners.shape[0]
+    start = ClosestVisit.start(live, leaves)
+    state = walk(index.visit, queries, curve(queries, live), start)
+    slots = ClosestVisit.leaf(state)[:, None] * tree.leaf + jnp.arange(tree.leaf)
+    faces = tree.order.at[slots].get(mode="fill", fill_value=f)
+    triangles = index.corners.at[faces].get(mode="fill", fill_value=jnp.inf)
+    gap = lambda corners, point: point - _barycentric(corners, point) @ corners
+    gaps = jax.vmap(jax.vmap(gap, in_axes=(0, None)))(triangles, queries)
+    squares = jnp.where(faces < f, jnp.sum(gaps**2, axis=-1), jnp.inf)
+    least = jnp.argmin(squares, axis=1)[:, None]
+    best = jnp.take_along_axis(faces, least, axis=1)[:, 0]
+    return jnp.where(live, jnp.minimum(best, f), f)
 
 
 def _barycentric(triangle, point):

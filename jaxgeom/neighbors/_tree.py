@@ -161,7 +161,7 @@ def _descend(tree: Tree, lane: _Lanes) -> _Lanes:
         down = left + (two < one)
         later = 2 * trail + (jnp.maximum(one, two) < worst)
         useful = jnp.minimum(one, two) < worst
-        away, rest = _next(node, trail)
+        away, rest = next_node(node, trail)
         node = jnp.where(inner, jnp.where(useful, down, away), node)
         return node, jnp.where(inner, jnp.where(useful, later, rest), trail)
 
@@ -178,7 +178,7 @@ def _visit(tree: Tree, lane: _Lanes, squares: Callable) -> _Lanes:
     found = jnp.where(there & jnp.isfinite(found), found, jnp.inf)
     take = lambda j, best: insert(best, found[j], slots[j])
     best = jax.lax.fori_loop(0, tree.leaf, take, lane.best)
-    node, trail = _next(lane.node, lane.trail)
+    node, trail = next_node(lane.node, lane.trail)
     return _Lanes(
         lane.row,
         jnp.where(there, node, lane.node),
@@ -188,7 +188,7 @@ def _visit(tree: Tree, lane: _Lanes, squares: Callable) -> _Lanes:
     )
 
 
-def _next(node, trail):
+def next_node(node, trail):
     """The deepest sibling left for later, and what is left then; node 0 at the end."""
     up = jax.lax.population_count((trail & -trail) - 1)
     more = trail != 0

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import safe_divide, safe_norm, safe_normalize
-from ..neighbors import AbstractBackend, CellList, Neighbors, build, knn
+from ..clouds import centered, frames, nearest_graph
+from ..neighbors import AbstractBackend, Neighbors
 from ..shapes import PointCloud
-from ._frames import frames
 
 
 def estimate(
@@ -26,7 +26,7 @@ def estimate(
 
     Source: Hoppe et al. 1992, Surface reconstruction from unorganized points, 3.1.
     """
-    normals = local_normals(cloud, nearby(cloud, k, backend))
+    normals = local_normals(cloud, nearest_graph(cloud, k, backend=backend))
     return eqx.tree_at(lambda c: c.normals, cloud, normals, is_leaf=lambda x: x is None)
 
 
@@ -36,42 +36,23 @@ def plane_residual(cloud: PointCloud, *, k: int = 16) -> Float[Array, " n"]:
     A measure of noise: about sigma sqrt(1 - 3/k) for Gaussian noise sigma, plus the
     part of the curvature. Zero for padding.
     """
-    near = nearby(cloud, k)
-    there, centered = _centered(cloud, near)
+    near = nearest_graph(cloud, k)
+    there = near.mask
+    gaps, _ = centered(cloud, near)
     normals = local_normals(cloud, near)
-    height = jnp.where(there, jnp.einsum("nkd,nd->nk", centered, normals), 0)
+    height = jnp.where(there, jnp.einsum("nkd,nd->nk", gaps, normals), 0)
     count = jnp.maximum(jnp.sum(there, axis=1), 1).astype(height.dtype)
     return safe_norm(height) / jnp.sqrt(count)
 
 
-def nearby(
-    cloud: PointCloud, k: int, backend: AbstractBackend | None = None
-) -> Neighbors:
-    """The k nearest points of every point of a cloud, itself among them."""
-    points = cloud.washed().points
-    backend = CellList(k) if backend is None else backend
-    index = build(points, cloud.mask, backend=backend)
-    return knn(index, points, k, mask=cloud.mask)
-
-
 def local_normals(cloud: PointCloud, near: Neighbors) -> Float[Array, "n 3"]:
     """The unit normals [n, 3] of the planes through given neighborhoods."""
-    _, centered = _centered(cloud, near)
+    gaps, _ = centered(cloud, near)
     # Neighborhoods of any size become of order 1, so that squares keep their digits.
-    size = jax.lax.stop_gradient(jnp.max(jnp.abs(centered), axis=(1, 2), keepdims=True))
-    scaled = centered / jnp.where(size > 0, size, 1)
+    size = jax.lax.stop_gradient(jnp.max(jnp.abs(gaps), axis=(1, 2), keepdims=True))
+    scaled = gaps / jnp.where(size > 0, size, 1)
     spread = jnp.einsum("nki,nkj->nij", scaled, scaled)
     return smallest_direction(spread)
-
-
-def _centered(cloud, near):
-    there = near.mask
-    points = jnp.asarray(cloud.washed().points)
-    shifted = points[jnp.where(there, near.indices, 0)] - points[:, None]
-    shifted = jnp.where(there[..., None], shifted, 0)
-    count = jnp.maximum(jnp.sum(there, axis=1), 1).astype(shifted.dtype)
-    mean = jnp.sum(shifted, axis=1) / count[:, None]
-    return there, jnp.where(there[..., None], shifted - mean[:, None], 0)
 
 
 @jax.custom_jvp

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import GeometryError, message, safe_divide
+from ..clouds import nearest_graph
 from ..neighbors import Neighbors, build, knn
 from ..neighbors._morton import bounds, morton_order
 from ..shapes import PointCloud
-from ._estimate import local_normals, nearby, unit
+from ._estimate import local_normals, unit
 from ._winding import consistent_dipoles, gradient
 
 
@@ -45,7 +46,7 @@ def orient_consistently(
     lacks are estimated from the k neighbors. Meant for closed surfaces and scans with
     moderate holes. Signs are constants under differentiation.
     """
-    near = nearby(cloud, k)
+    near = nearest_graph(cloud, k)
     normals = local_normals(cloud, near) if cloud.normals is None else cloud.normals
     washed = jnp.where(cloud.mask[:, None], jnp.asarray(normals), 0)
     # A sign is piecewise constant: it has no gradient.

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core import RESULTS, bucket, failure_where, first_failure
+from ..clouds import thin
 from ..normals import estimate
 from ..registration import (
     Method,
     Registration,
     Symmetric,
     icp,
-    thin,
 )
 from ..shapes import PointCloud
 

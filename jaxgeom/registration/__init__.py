@@ -68,7 +68,6 @@ from ._starts import icp_from_many as icp_from_many
 from ._stiffness import AsRigidAsPossible as AsRigidAsPossible
 from ._stiffness import PerVertexAffine as PerVertexAffine
 from ._stiffness import StiffnessSchedule as StiffnessSchedule
-from ._thin import thin as thin
 from ._uncertainty import pose_covariance as pose_covariance
 from ._uncertainty import sandwich_covariance as sandwich_covariance
 from ._viewgraph import Poses as Poses

@@ -6,12 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from .._core import RESULTS, GeometryError, failure_where, first_failure, message
+from ..clouds import thin
 from ..neighbors import CellList, build, knn
 from ..shapes import PointCloud
 from ..transforms import Rigid, procrustes
 from ._features import fpfh, match_features
 from ._ransac import conclude, make_pairs, propose
-from ._thin import thin
 
 _FACING = 0.7
 _POLISHED = 4

@@ -32,11 +32,11 @@ from .._core import (
     message,
     safe_divide,
 )
+from ..clouds import thin
 from ..neighbors import AbstractBackend, CellList, build, knn
 from ..shapes import PointCloud
 from ..transforms import Rigid
 from ._kernels import AbstractKernel, Tukey
-from ._thin import thin
 
 _FACING = 0.7
 _FEWEST = 12

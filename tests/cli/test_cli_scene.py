@@ -38,6 +38,28 @@ def test_a_field_knows_its_box_and_becomes_a_mesh(scene, tmp_path, capsys):
     assert facts["result"]["watertight"] and facts["result"]["euler"] == 2
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--resolution", "257"),
+        ("--method", "dual-contouring", "--tolerance", "0.02"),
+        ("--method", "dual-grid", "--tolerance", "0.02"),
+        ("--method", "dual-grid"),
+    ],
+    ids=["bricks", "octree", "dual grid octree", "dual grid"],
+)
+def test_methods_and_sizes_of_meshes(scene, tmp_path, options):
+    mesh, report = tmp_path / "ball.ply", tmp_path / "ball.json"
+    arguments = ["mesh", f"{scene}:ball", "-o", str(mesh), "--resolution", "40"]
+    assert main([*arguments, "--report", str(report), *options]) == 0
+    vertices = np.asarray(load_mesh(mesh).vertices)
+    gaps = np.linalg.norm(vertices - [0.1, 0.2, 0.3], axis=1) - 0.7
+    assert np.abs(gaps).max() < 0.04
+    facts = json.loads(report.read_text())
+    assert facts["result"]["watertight"] and facts["result"]["euler"] == 2
+
+
 def test_a_callable_needs_a_box(scene, tmp_path, capsys):
     mesh = tmp_path / "egg.ply"
     arguments = ["mesh", f"{scene}:egg", "-o", str(mesh), "--resolution", "24"]

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxgeom import fields as jf
 from jaxgeom._core import RESULTS
@@ -30,6 +31,7 @@ def errors(body, number):
     return np.abs(found.values - jf.sample(body, grid))
 
 
+@pytest.mark.slow
 def test_second_order_on_a_sphere(x64):
     body = jf.Sphere(0.7)
     coarse, fine = errors(body, 17), errors(body, 33)

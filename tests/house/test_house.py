@@ -14,9 +14,9 @@ FLOORS = [
     {"_core"},
     {"shapes", "transforms"},
     {"neighbors", "linear"},
-    {"fields", "meshes", "parametric"},
+    {"fields", "meshes", "parametric", "subdivision", "clouds"},
     {"isosurface", "reconstruction", "registration", "normals"},
-    {"pipelines"},
+    {"pipelines", "convert"},
     {"io", "render"},
     {"cli"},
 ]

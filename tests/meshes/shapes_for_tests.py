@@ -75,3 +75,43 @@ def central_difference(function, x, direction, step=1e-5):
         )
     )
     return both(x)
+
+
+def slope_and_difference(function, x, way, step=1e-6):
+    """The gradient at x, the derivative along `way` by it and by differences.
+
+    One program gives all three.
+    """
+    run = jax.jit(jax.value_and_grad(function))
+    slope = np.asarray(run(x)[1])
+    numeric = (run(x + step * way)[0] - run(x - step * way)[0]) / (2 * step)
+    return slope, float(np.vdot(slope, way)), float(numeric)
+
+
+def sized(mesh, v=900, f=1750, dtype=float, garbage=np.nan):
+    """The mesh in arrays of one canonical size, so that tests share programs."""
+    vertices = np.full((v, 3), garbage)
+    vertices[: mesh.vertices.shape[0]] = mesh.vertices
+    faces = np.full((f, 3), v, np.int32)
+    faces[: mesh.faces.shape[0]] = mesh.faces
+    counts = {
+        "num_vertices": np.int32(mesh.vertices.shape[0]),
+        "num_faces": np.int32(mesh.faces.shape[0]),
+    }
+    return TriangleMesh(jnp.asarray(vertices, dtype), jnp.asarray(faces), **counts)
+
+
+def cut(mesh, last=-20):
+    """The mesh without its last faces."""
+    return TriangleMesh(mesh.vertices, np.asarray(mesh.faces)[:last])
+
+
+def flat_patch():
+    """A plane in space with a triangulation of a jittered lattice of 7 x 6."""
+    i, j = (x.ravel() for x in np.meshgrid(range(7), range(6), indexing="ij"))
+    u, w = np.stack([i, j]) + 0.25 * np.random.default_rng(3).uniform(-1, 1, (2, 42))
+    node = lambda di, dj: ((i + di) * 6 + j + dj)[(i < 6) & (j < 5)]
+    lower = np.stack([node(0, 0), node(1, 0), node(1, 1)], -1)
+    upper = np.stack([node(0, 0), node(1, 1), node(0, 1)], -1)
+    plane = np.stack([0.7 * u + 0.2 * w, 0.9 * w, 0.4 * u - 0.3 * w + 2], -1)
+    return TriangleMesh(plane, np.concatenate([lower, upper]))

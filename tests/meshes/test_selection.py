@@ -55,6 +55,7 @@ def test_specks_are_dropped_by_area():
     same_corners(left, moved(box_mesh((4.0, 5.0, 6.0)), (9.0, 0, 0)))
 
 
+@pytest.mark.slow
 def test_split_agrees_with_trimesh():
     mesh = padded(specks())
     parts = split(mesh)

@@ -7,7 +7,14 @@ import pytest
 import trimesh
 
 from jaxgeom._core import RESULTS
-from jaxgeom.neighbors import signed_distance, winding_number
+from jaxgeom.neighbors import (
+    Exact,
+    Hierarchical,
+    Winding,
+    inside,
+    signed_distance,
+    winding_number,
+)
 from jaxgeom.shapes import TriangleMesh
 
 OCTAHEDRON = trimesh.Trimesh(
@@ -142,3 +149,59 @@ def test_padding_open_and_empty_meshes():
         and (winding_number(none, queries) == 0).all()
     )
     assert bool(lost.result == RESULTS.no_surface)
+
+
+def _bumpy(dtype):
+    peer = trimesh.creation.icosphere(subdivisions=3, radius=1.7)
+    v = peer.vertices * (1 + 0.2 * np.sin(5 * peer.vertices[:, :1]))
+    v = v * [1, 0.3, 2] + [3, 1, -2]
+    return TriangleMesh(jnp.asarray(v, dtype), jnp.asarray(peer.faces[:-30]))
+
+
+def test_hierarchical_winding_converges_to_the_exact_one():
+    mesh = _bumpy(np.float32)
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-2, 2, (400, 3)) * [1, 0.4, 2] + [3, 1, -2]
+    points = jnp.asarray(points, jnp.float32).at[7].set(jnp.nan)
+    exact = jax.jit(winding_number)(mesh, points)
+
+    @jax.jit
+    def error(beta):
+        found = winding_number(mesh, points, method=Hierarchical(beta))
+        return jnp.nanmax(jnp.abs(found - exact)), jnp.isnan(found)
+
+    worst = [float(error(beta)[0]) for beta in (1.5, 3.0, 6.0)]
+    # Three terms: doubling beta divides the error by about 2^4.
+    assert worst[0] > 8 * worst[1] > 64 * worst[2], worst
+    assert worst[1] < 1e-3 and worst[2] < 1e-4, worst
+    assert list(jnp.flatnonzero(error(2.0)[1])) == [7]
+    clear = jnp.abs(exact - 0.5) > 0.01
+    agree = jax.jit(inside)(mesh, points) == (exact > 0.5)
+    assert agree[clear].all() and (exact > 0.5).any()
+
+
+def test_signs_by_winding_and_their_gradients(x64):
+    mesh = _bumpy(np.float64)
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-2, 2, (40, 3)) * [1, 0.4, 2] + [3, 1, -2]
+    points = jnp.asarray(points)
+    ways = [
+        jax.random.normal(jax.random.key(i), x.shape)
+        for i, x in enumerate((mesh.vertices, points))
+    ]
+
+    @jax.jit
+    def both(h):
+        def at(t):
+            moved = TriangleMesh(mesh.vertices + t * ways[0], mesh.faces)
+            there = points + t * ways[1]
+            out = signed_distance(moved, there, sign=Winding())
+            return out.distances
+
+        slope = jax.jvp(at, (0.0,), (1.0,))[1]
+        return at(0.0), slope, (at(h) - at(-h)) / (2 * h)
+
+    found, exact, numeric = both(1e-6)
+    np.testing.assert_allclose(exact, numeric, rtol=1e-6, atol=1e-8)
+    around = winding_number(mesh, points, method=Exact())
+    np.testing.assert_array_equal(found < 0, around > 0.5)

@@ -60,9 +60,8 @@ def test_given_normals_only_change_sign():
     np.testing.assert_allclose(out.normals, 3 * truth, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("armadillo", marks=pytest.mark.slow), "horse"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["armadillo", "horse"])
 def test_real_shapes(data, name):
     mesh = trimesh.load(data / "meshes" / f"{name}.ply", process=False)
     points, truth = _sampled(mesh, 10_000, 0)

@@ -116,6 +116,7 @@ def test_a_scan_far_from_all_others_is_a_status(views):
     np.testing.assert_allclose(out.world_from_scan.translation[2], away[2], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_too_little_room_is_a_status(views):
     clouds, truth = views
     out = jax.jit(

@@ -1,0 +1,32 @@
+"""Operations on point clouds: thinning, outliers, neighborhoods, boxes, primitives."""
+
+from ..shapes import subsample as subsample
+from ._boxes import Box as Box
+from ._boxes import MinimalVolume as MinimalVolume
+from ._boxes import PrincipalAxes as PrincipalAxes
+from ._boxes import bounding_box as bounding_box
+from ._boxes import crop as crop
+from ._boxes import oriented_box as oriented_box
+from ._farthest import farthest_points as farthest_points
+from ._frames import frames as frames
+from ._merge import merge as merge
+from ._neighborhoods import PrincipalFrames as PrincipalFrames
+from ._neighborhoods import centered as centered
+from ._neighborhoods import density as density
+from ._neighborhoods import nearest_graph as nearest_graph
+from ._neighborhoods import principal_frames as principal_frames
+from ._neighborhoods import surface_variation as surface_variation
+from ._outliers import keep as keep
+from ._outliers import radius_inliers as radius_inliers
+from ._outliers import statistical_inliers as statistical_inliers
+from ._primitives import Cylinder as Cylinder
+from ._primitives import CylinderShape as CylinderShape
+from ._primitives import Plane as Plane
+from ._primitives import PlaneShape as PlaneShape
+from ._primitives import Sphere as Sphere
+from ._primitives import SphereShape as SphereShape
+from ._ransac import PrimitiveFit as PrimitiveFit
+from ._ransac import fit_primitive as fit_primitive
+from ._voxels import VoxelSample as VoxelSample
+from ._voxels import thin as thin
+from ._voxels import voxel_downsample as voxel_downsample

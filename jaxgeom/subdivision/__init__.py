@@ -1,0 +1,34 @@
+"""Subdivision curves and surfaces as sparse linear operators."""
+
+from ._creases import AbstractDecay as AbstractDecay
+from ._creases import ChaikinDecay as ChaikinDecay
+from ._creases import Creases as Creases
+from ._creases import UniformDecay as UniformDecay
+from ._curves import AbstractCurveScheme as AbstractCurveScheme
+from ._curves import Chaikin as Chaikin
+from ._curves import FourPoint as FourPoint
+from ._curves import LaneRiesenfeld as LaneRiesenfeld
+from ._curves import curve_limit as curve_limit
+from ._curves import curve_refinement as curve_refinement
+from ._curves import subdivide_curve as subdivide_curve
+from ._ends import AbstractEnds as AbstractEnds
+from ._ends import Closed as Closed
+from ._ends import FreeEnds as FreeEnds
+from ._ends import KeptEnds as KeptEnds
+from ._fit import ControlFit as ControlFit
+from ._fit import fit_control_mesh as fit_control_mesh
+from ._limit import Limit as Limit
+from ._limit import limit as limit
+from ._operator import Refinement as Refinement
+from ._schemes import AbstractLoopWeights as AbstractLoopWeights
+from ._schemes import AbstractScheme as AbstractScheme
+from ._schemes import Bilinear as Bilinear
+from ._schemes import CatmullClark as CatmullClark
+from ._schemes import Loop as Loop
+from ._schemes import Midpoint as Midpoint
+from ._schemes import Original as Original
+from ._schemes import Warren as Warren
+from ._subdivide import Subdivided as Subdivided
+from ._subdivide import SubdivisionPlan as SubdivisionPlan
+from ._subdivide import plan_subdivision as plan_subdivision
+from ._subdivide import subdivide as subdivide
