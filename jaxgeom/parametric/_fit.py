@@ -143,7 +143,9 @@ def _solve(rows, pulls, points, weights, smoothing):
     share = jnp.sqrt(_ones(weights, n, points) / n)[:, None]
     pull = jnp.sqrt(jnp.asarray(smoothing, points.dtype) / max(len(pulls), 1))
     system = jnp.concatenate([share * rows, pull * pulls])
-    side = jnp.concatenate([share * points, jnp.zeros((len(pulls), points.shape[1]))])
+    side = jnp.concatenate(
+        [share * points, jnp.zeros_like(points, shape=(len(pulls), points.shape[1]))]
+    )
     # With fewer rows than unknowns QR has no square factor: rows of zero add none.
     lack = max(0, system.shape[1] - system.shape[0])
     pad = lambda x: jnp.pad(x, ((0, lack), (0, 0)))
