@@ -36,7 +36,9 @@ def refine_fit(
 
     **Statuses:** `not_converged` after `max_steps`; the result is the best so far.
 
-    The Jacobian is dense, [3 n, 3 control points]. Not differentiable.
+    The Jacobian is dense, [3 n, 3 control points]. Not differentiable. Points in single
+    precision need a session without `jax_enable_x64`: optimistix mixes the two there.
+    A start far off in its parameters may end in a local minimum.
     Source: W. Wang, H. Pottmann, Y. Liu, Fitting B-spline curves to point clouds by
     curvature-based squared distance minimization, 2006.
     """
