@@ -15,6 +15,9 @@ from ._fields import mesh_to_field as mesh_to_field
 from ._fields import mesh_to_grid as mesh_to_grid
 from ._polygons import mesh_to_polygons as mesh_to_polygons
 from ._polygons import polygons_to_mesh as polygons_to_mesh
+from ._surfaces import surface_to_cloud as surface_to_cloud
+from ._surfaces import surface_to_field as surface_to_field
+from ._surfaces import surface_to_mesh as surface_to_mesh
 from ._table import CONVERSIONS as CONVERSIONS
 from ._table import Conversion as Conversion
 from ._table import table as table

@@ -67,6 +67,15 @@ CONVERSIONS = (
     Conversion(
         "cloud_to_mesh", "cloud", "mesh", False, "the zero surface of that field"
     ),
+    Conversion(
+        "surface_to_mesh", "parametric", "mesh", False, "the surface, to order cell^2"
+    ),
+    Conversion(
+        "surface_to_cloud", "parametric", "cloud", False, "points of it, and normals"
+    ),
+    Conversion(
+        "surface_to_field", "parametric", "field", False, "that mesh's signed distance"
+    ),
 )
 
 

@@ -38,6 +38,7 @@ def files(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_register_prints_and_writes_the_motion(files, tmp_path, capsys):
     moved, report = tmp_path / "moved.ply", tmp_path / "report.json"
     arguments = ["register", str(files / "source.ply"), str(files / "target.ply")]

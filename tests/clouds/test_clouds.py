@@ -139,6 +139,7 @@ def test_frames_and_density_are_those_of_numpy():
     np.testing.assert_allclose(graph.distances[:n], distances, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_variances_have_the_gradient_of_central_differences(x64):
     points = jnp.asarray(_points(40), float)
     way = jax.random.normal(jax.random.key(0), points.shape)
@@ -231,6 +232,7 @@ def test_merging_moves_points_and_normals():
         merge([])
 
 
+@pytest.mark.slow
 def test_padding_and_batches():
     cloud, bare = _cloud(), _cloud(0)
     pair = jax.tree.map(lambda *x: jnp.stack(x), cloud, turned(cloud))

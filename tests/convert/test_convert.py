@@ -9,6 +9,7 @@ from jaxgeom import GeometryError, Grid, PointCloud, TriangleMesh, convert
 from jaxgeom.fields import Sphere, Torus
 from jaxgeom.meshes import box_mesh, icosphere, volume
 from jaxgeom.neighbors import closest_on_mesh
+from jaxgeom.parametric import Ellipsoid
 from jaxgeom.shapes import PolygonMesh
 
 CENTER, SIDES = np.asarray([3.0, -1.0, 2.0]), np.asarray([1.3, 0.7, 1.1])
@@ -72,6 +73,7 @@ def test_field_and_grid_agree_at_the_nodes():
     np.testing.assert_allclose(again, values, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_field_to_cloud_lies_on_the_surface():
     cloud = convert.field_to_cloud(_body, _grid(24), 200, key=jax.random.key(0))
     assert int(cloud.num_points) == 200
@@ -138,3 +140,19 @@ def test_polygons_and_triangles():
     box = convert.polygons_to_mesh(PolygonMesh(corners.vertices, quads))
     np.testing.assert_allclose(volume(box), 6, rtol=1e-6)
     assert box.faces.shape == (12, 3)
+
+
+def test_parametric_surfaces_become_meshes_clouds_and_fields():
+    """The mesh is closed and inside, nearer by 4 with cells half as wide."""
+    body = Ellipsoid(jnp.float32([1.3, 0.7, 1.1]))
+    true, gaps = 4 / 3 * np.pi * 1.3 * 0.7 * 1.1, []
+    for n in (12, 24):
+        mesh = convert.surface_to_mesh(body, (2 * n, n))
+        gaps.append(float(true - volume(mesh)))
+    assert 3.6 < gaps[0] / gaps[1] < 4.4 and gaps[1] > 0
+    cloud = convert.surface_to_cloud(body, (48, 24))
+    level = jnp.sum((cloud.points / jnp.float32([1.3, 0.7, 1.1])) ** 2, axis=1)
+    np.testing.assert_allclose(level, 1, atol=1e-5)
+    field = convert.surface_to_field(body, (48, 24))
+    assert abs(float(field(jnp.float32([0, 0, 2.0]))) - 0.9) < 5e-3
+    assert float(field(jnp.float32([0.1, 0.2, 0.1]))) < 0

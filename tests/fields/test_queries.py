@@ -126,6 +126,7 @@ def test_sampled_is_trilinear_and_clamped(x64):
     np.testing.assert_allclose(weights.sum(), 1, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_scan_sees_the_surface_from_the_camera():
     statue = jf.demo_statue()
     cameras = [jf.Camera((0.5, -4.0, 1.0)), jf.Camera((3.0, 2.5, 0.4))]

@@ -40,6 +40,7 @@ def test_second_order_on_a_sphere(x64):
     assert fine.mean() < 0.04 * 2.4 / 32 and fine.max() < 0.2 * 2.4 / 32
 
 
+@pytest.mark.slow
 def test_a_box_loses_its_edges_only(x64):
     body = jf.Box((0.6, 0.5, 0.45))
     coarse, fine = errors(body, 17), errors(body, 33)

@@ -122,6 +122,7 @@ def test_overflow_is_told_and_leaves_valid_faces(tools, method, short):
     np.testing.assert_allclose(kept[named], known[named], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", SHARED, ids=lambda m: type(m).__name__)
 def test_vmap_is_the_loop(tools, method):
     grid, capacity = tools.grid_of(SHAPE), Capacity(900, 2600)
@@ -137,7 +138,7 @@ def test_vmap_is_the_loop(tools, method):
         np.testing.assert_allclose(mesh.vertices, expected.mesh.vertices, atol=1e-5)
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", SHARED, ids=lambda m: type(m).__name__)
 def test_statuses_and_bad_samples(tools, method):
     grid, values = tools.grid_of(SHAPE), noise(11)
     values[[2, 4, 6], [3, 1, 5], [8, 2, 9]] = np.nan, np.inf, -np.inf
@@ -151,7 +152,7 @@ def test_statuses_and_bad_samples(tools, method):
         method(noise(), tools.grid_of((9, 7, 12)), capacity=Capacity(9, 9))
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", SHARED, ids=lambda m: type(m).__name__)
 def test_derivatives_are_central_differences(x64, tools, method):
     values = noise(4, (5, 4, 6), np.float64)
     grid = tools.grid_of(values.shape, np.float64)
@@ -172,7 +173,7 @@ def test_derivatives_are_central_differences(x64, tools, method):
         np.testing.assert_allclose(np.sum(slopes[i] * along), expected, rtol=2e-5)
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", SHARED, ids=lambda m: type(m).__name__)
 def test_derivatives_are_finite_beside_ties_and_bad_samples(tools, method):
     values = ties(7)
     values[3, 3, 3], values[5, 2, 7], values[1, 5, 4] = np.nan, np.inf, -np.inf

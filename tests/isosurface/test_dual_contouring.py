@@ -151,6 +151,7 @@ def test_derivatives_through_a_field(x64):
         np.testing.assert_allclose(np.sum(slopes[i] * along), expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_field_that_leaves_the_grid_is_closed_half_a_cell_outside(tools):
     grid = box_grid()
     out = extract(Sphere(1.2), grid, method=DualContouring(), closed=True)

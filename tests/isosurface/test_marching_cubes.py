@@ -47,6 +47,7 @@ def radius_error(n, placement):
     return np.abs(radii - 0.7).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "placement, order",
     [(Linear(), 2), pytest.param(Cubic(), 4, marks=pytest.mark.slow)],

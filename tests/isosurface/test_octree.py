@@ -76,6 +76,7 @@ def test_merging_keeps_the_topology_of_the_worst_fields(tools, _, fields):
     assert after < 0.9 * before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("_, fields", FIELDS)
 def test_dual_grid_is_closed_on_the_worst_fields(tools, _, fields):
     grid, method = tools.grid_of(SHAPE), DualGridCubes(0.3, levels=2)
@@ -197,6 +198,7 @@ def test_a_feature_is_where_the_planes_meet(x64):
     assert np.ptp(slopes_of @ ((0.5 - apex) * size)) > 0.02 and error.item() < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS, **NAMES)
 def test_derivatives_are_central_differences(x64, method):
     grid = body_grid((7, 6, 8), np.float64)

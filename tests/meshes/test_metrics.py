@@ -65,6 +65,7 @@ METRICS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METRICS)
 def test_padding_changes_nothing(name):
     a, b = two_clouds()
@@ -158,6 +159,7 @@ def test_rms_of_a_point_on_the_surface_has_gradient_zero():
     assert jnp.all(jax.grad(rms)(mesh.vertices[:3]) == 0)
 
 
+@pytest.mark.slow
 def test_evaluation_of_concentric_spheres():
     truth, found = icosphere(3), icosphere(3, radius=1.05)
     e = jax.jit(lambda a, b, k: evaluate(a, b, key=k, num=2000))(

@@ -85,6 +85,7 @@ def test_padding_changes_nothing():
     assert jnp.all(jnp.isfinite(gradient))
 
 
+@pytest.mark.slow
 def test_vmap_is_loop():
     meshes = (
         icosphere(1),

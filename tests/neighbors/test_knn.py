@@ -65,6 +65,7 @@ def test_equals_a_tree(name, backend):
     _assert_exact(points, queries, 5, find(points, queries))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", [1, pytest.param(64, marks=pytest.mark.slow)])
 def test_other_counts_of_neighbors(k):
     points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS["surface"])
@@ -99,6 +100,7 @@ def test_max_distance_is_a_gate(backend):
     assert (gated.distances == jnp.where(inside, free.distances, jnp.inf)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", [CellList(), BruteForce(), HostTree(workers=1)])
 def test_vmap_is_a_loop(backend):
     names = ["surface", "volume", "plane"]
@@ -124,6 +126,7 @@ def test_gradients(x64):
     assert jnp.isfinite(zero).all()
 
 
+@pytest.mark.slow
 def test_padding_has_no_gradient():
     points = jnp.asarray(CLOUDS["volume"][0][:30], jnp.float32)
     mask = jnp.arange(30) % 3 > 0

@@ -180,6 +180,7 @@ def test_hierarchical_winding_converges_to_the_exact_one():
     assert agree[clear].all() and (exact > 0.5).any()
 
 
+@pytest.mark.slow
 def test_signs_by_winding_and_their_gradients(x64):
     mesh = _bumpy(np.float64)
     rng = np.random.default_rng(5)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import trimesh
 
 from jaxgeom._core import RESULTS
@@ -113,6 +114,7 @@ def test_real_mesh(data):
     np.testing.assert_allclose(out.distances, want, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_vmap_is_a_loop():
     count = 33
     mesh = _bumpy()

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxgeom.normals import estimate, plane_residual
 from jaxgeom.shapes import PointCloud
@@ -21,6 +22,7 @@ def test_normals_of_a_sphere():
     assert np.abs((np.asarray(normals) * unit).sum(axis=1)).min() > 0.98
 
 
+@pytest.mark.slow
 def test_the_error_falls_with_the_spacing():
     angles, run = [], jax.jit(lambda c: estimate(c, k=12).normals)
     for n in (1000, 4000):
@@ -40,6 +42,7 @@ def test_residual_measures_noise():
     np.testing.assert_allclose(rms, noise * np.sqrt(1 - 3 / k), rtol=0.05)
 
 
+@pytest.mark.slow
 def test_padding_changes_nothing():
     unit = _sphere(500)
     mask = np.arange(640) < 500
@@ -59,6 +62,7 @@ def test_lines_and_single_places_have_no_normal():
         assert (out.normals == 0).all()
 
 
+@pytest.mark.slow
 def test_gradients(x64):
     points = jnp.asarray(_sphere(300, dtype=np.float64)) * jnp.asarray([1, 2, 0.7])
     fixed = jax.jit(lambda c: estimate(c, k=10).normals)(PointCloud(points))

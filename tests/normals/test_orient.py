@@ -53,6 +53,7 @@ def test_two_objects_and_a_hollow_one():
     assert (out.normals[2500:] == 0).all()
 
 
+@pytest.mark.slow
 def test_given_normals_only_change_sign():
     points, truth = _sampled(trimesh.creation.torus(1.5, 0.5), 1500, 2)
     flips = np.where(np.random.default_rng(0).random(1500) < 0.5, -3, 3)[:, None]

@@ -161,6 +161,7 @@ class Waves(eqx.Module):
         return jnp.stack([u, v, wave])
 
 
+@pytest.mark.slow
 def test_derivatives(x64):
     """Against central differences, inside the domain, at an end and at a corner."""
     places = jnp.array([[0.7, 0.4, 0.5], [0.5, -0.4, 0.3], [-0.4, -0.5, 0.2]])
@@ -193,6 +194,7 @@ def test_derivatives(x64):
     np.testing.assert_allclose(forward[:, 5, :3], unit, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_search_cut_short_says_so(x64):
     shape, q = jp.Ellipsoid((0.7, 0.2, 0.5)), queries()
     short = nearest(shape, q, max_steps=1, starts=(4, 3), num_starts=1)

@@ -48,6 +48,7 @@ def test_units_and_places_do_not_matter(scale, shift):
     assert out.result == jg.RESULTS.successful
 
 
+@pytest.mark.slow
 def test_points_alone_are_enough():
     points, _ = _bumpy(3000)
     out = jg.reconstruct(points, resolution=32)
@@ -68,6 +69,7 @@ def test_attributes_arrive_at_the_vertices():
     )
 
 
+@pytest.mark.slow
 def test_trim_leaves_a_hole_where_nothing_was_seen():
     points, normals = _bumpy(4400)
     seen = points[:, 2] > -0.5  # about 3000 of them: one program for many tests
@@ -79,6 +81,7 @@ def test_trim_leaves_a_hole_where_nothing_was_seen():
     assert np.asarray(cut.mesh.vertices)[:, 2].min() > -0.75
 
 
+@pytest.mark.slow
 def test_stray_points_far_away_do_no_harm():
     points, normals = _bumpy(3000)
     stray = np.array([[2.0, 1.5, -1.6], [-1.8, 0.3, 2.2], [0.1, 1.9, 0.2]])
@@ -92,6 +95,7 @@ def test_stray_points_far_away_do_no_harm():
     np.testing.assert_allclose(radius, 1, atol=0.04)
 
 
+@pytest.mark.slow
 def test_inverted_normals_are_noted():
     points, normals = _bumpy(3000)
     out = jg.reconstruct(jg.PointCloud(points, -normals), resolution=32)

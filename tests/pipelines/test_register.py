@@ -91,6 +91,7 @@ def test_points_not_finite_or_masked_are_points_removed():
         np.testing.assert_array_equal(_matrix(_align(cloud, target)), _matrix(removed))
 
 
+@pytest.mark.slow
 def test_given_normals_are_used_where_both_have_them():
     source, target = _scans()
     wrong = np.broadcast_to(np.float32([0, 0, 1]), (N, 3))

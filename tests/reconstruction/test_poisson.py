@@ -103,6 +103,7 @@ def test_fixed_nodes_are_outside(boundary):
     assert _surface_error(out) < 0.2
 
 
+@pytest.mark.slow
 def test_padding_changes_nothing_and_has_no_gradient():
     cloud = _torus(1500)
     grid = _grid(cloud)
@@ -137,6 +138,7 @@ def test_weights_are_confidence():
     assert _surface_error(run(both, grid)) > 2 * _surface_error(out)
 
 
+@pytest.mark.slow
 def test_gradients_are_central_differences(x64):
     cloud = _torus(700, dtype=np.float64)
     grid = _grid(cloud)
@@ -185,6 +187,7 @@ def test_statuses():
     assert early.result == RESULTS.not_converged
 
 
+@pytest.mark.slow
 def test_functions_and_settings_agree():
     cloud = _torus(800)
     grid = _grid(cloud)

@@ -137,6 +137,7 @@ def test_padding_and_keys():
     np.testing.assert_array_equal(other.inliers, right & mask)
 
 
+@pytest.mark.slow
 def test_derivative_is_that_of_the_fit_to_the_inliers():
     source, target, right = _pairs(0.5)
     mask = np.ones(N, bool)

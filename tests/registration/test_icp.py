@@ -262,6 +262,7 @@ class _Idle(optx.AbstractMinimiser):
         return y, aux, {}
 
 
+@pytest.mark.slow
 def test_a_solver_without_a_way_down_is_a_status():
     source, target = _pair()
     method = _method(solver=Minimise(_Idle()))
@@ -290,6 +291,7 @@ def test_mixing_takes_fewer_steps_to_the_same_place(x64):
     assert _off(plain, 3 * MOVE) < 1e-6 and _off(mixed, 3 * MOVE) < 1e-6
 
 
+@pytest.mark.slow
 def test_pairs_that_are_kept_are_those_of_a_new_search():
     rng = np.random.default_rng(7)
     source, target = _pair()
@@ -330,6 +332,7 @@ def test_planes_and_lines_are_degenerate():
     assert found.result == RESULTS.degenerate_input
 
 
+@pytest.mark.slow
 def test_locked_directions_and_prior():
     source, target = _pair()
     shift = align(source, target, method=_method(model=RigidModel(translation_only())))

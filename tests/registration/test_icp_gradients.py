@@ -84,6 +84,7 @@ def test_implicit_derivative_is_that_of_the_answer(objective, x64):
         assert (np.abs(slopes[i]).max() > 1e-6) == used
 
 
+@pytest.mark.slow
 def test_forward_reverse_and_unrolled_agree(x64):
     parts = _scene(0)
     loss = lambda parts: _number(_pose(Symmetric(), icp, *parts))

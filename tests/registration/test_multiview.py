@@ -81,6 +81,7 @@ def _errors(found, truth):
 _solve = jax.jit(lambda clouds, start: multiview(clouds, start, voxel_size=0.06))
 
 
+@pytest.mark.slow
 def test_joint_poses_are_exact_for_one_surface(views):
     clouds, truth = views
     off = _turns(4, 2, 0.05)

@@ -103,6 +103,7 @@ def test_missing_points_and_padding_do_not_matter(x64):
     assert not np.any(fit.mean[N:])
 
 
+@pytest.mark.slow
 def test_hopeless_shape_has_no_say(x64):
     shapes, mask, _ = _shapes(scale=False)
     expected = generalized_procrustes(shapes[1:], mask[1:])
@@ -120,6 +121,7 @@ def test_hopeless_shape_has_no_say(x64):
     assert short.result == RESULTS.not_converged and short.steps == 2
 
 
+@pytest.mark.slow
 def test_derivative_of_the_fixed_point(x64):
     shapes, mask, _ = _shapes(0.3)
     shapes, mask = jnp.asarray(shapes[:4]), jnp.asarray(mask[:4])

@@ -54,6 +54,7 @@ def test_rmse_is_that_of_the_transform(x64):
         np.testing.assert_allclose(fit.rmse**2, square / weights.sum(1), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_scale_is_the_least_squares_one(x64):
     source, target, weights = _problems(5)
     best = scaled_all(source, target, weights)
@@ -196,6 +197,7 @@ def test_a_reflection_comes_only_when_asked_for(name, x64):
     np.testing.assert_allclose(fit.transform.rotation, np.eye(3), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_masked_rows_are_as_if_removed():
     source, target, weights = (x[0].astype(np.float32) for x in _problems(1))
     expected = procrustes(source, target, weights, scaling=True)
