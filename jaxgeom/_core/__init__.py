@@ -8,6 +8,7 @@ from ._maths import prefix_sum as prefix_sum
 from ._maths import safe_divide as safe_divide
 from ._maths import safe_norm as safe_norm
 from ._maths import safe_normalize as safe_normalize
+from ._maths import tangents_to as tangents_to
 from ._sizes import bucket as bucket
 from ._stage import runtime_token as runtime_token
 from ._stage import stage as stage

@@ -28,6 +28,20 @@ def safe_divide(a, b):
     return jnp.where(nonzero, a, 0.0) / jnp.where(nonzero, b, 1.0)
 
 
+def tangents_to(n: Float[Array, " 3"]) -> Float[Array, "2 3"]:
+    """Two unit vectors at right angles to the unit vector n and to each other.
+
+    Source: T. Duff et al., Building an orthonormal basis, revisited, 2017.
+    """
+    x, y, z = n
+    sign = jnp.where(z < 0, -1, 1).astype(n.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = jnp.stack([1 + sign * x * x * a, sign * b, -sign * x])
+    second = jnp.stack([b, sign + y * y * a, -y])
+    return jnp.stack([first, second])
+
+
 _BLOCK = 16
 _SMALL = 4096
 

@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 
 from ..fields import MeshDistance, Sampled, sample
 from ..isosurface import Extraction, MarchingCubes, extract
-from ..neighbors import Pseudonormal, signed_distance
+from ..meshes import voxelize
+from ..neighbors import AbstractSign, Pseudonormal
 from ..shapes import Grid, TriangleMesh
 
 _MARCHING_CUBES = MarchingCubes()
@@ -20,15 +21,14 @@ def mesh_to_field(mesh: TriangleMesh) -> MeshDistance:
 
 
 def mesh_to_grid(
-    mesh: TriangleMesh, grid: Grid, *, sign=_PSEUDONORMAL
+    mesh: TriangleMesh, grid: Grid, *, sign: AbstractSign = _PSEUDONORMAL
 ) -> Float[Array, "x y z"]:
     """The signed distance [x, y, z] of a mesh at the nodes of a grid.
 
     Exact at the nodes; between them details below the spacing are lost. `sign` is
     `neighbors.Pseudonormal()` for closed meshes or `Winding()` for any.
     """
-    nodes = grid.nodes().reshape(-1, 3)
-    return signed_distance(mesh, nodes, sign=sign).distances.reshape(grid.shape)
+    return voxelize(mesh, grid, sign=sign)
 
 
 def field_to_grid(field: Callable, grid: Grid) -> Float[Array, "x y z"]:

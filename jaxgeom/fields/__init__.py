@@ -18,7 +18,6 @@ from ._claims import Claims as Claims
 from ._claims import Exactness as Exactness
 from ._claims import Trust as Trust
 from ._conditioned import Conditioned as Conditioned
-from ._curvature import Curvatures as Curvatures
 from ._curvature import curvatures as curvatures
 from ._curvature import gradient as gradient
 from ._curvature import hessian as hessian

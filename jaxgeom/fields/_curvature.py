@@ -2,25 +2,12 @@
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._core import safe_divide, safe_norm, safe_normalize
-
-
-class Curvatures(eqx.Module):
-    """How the level set of a field bends at a point; positive where it is convex.
-
-    - `mean`: (k1 + k2) / 2, in 1 / length; 1 / r on a sphere.
-    - `gaussian`: k1 k2, in 1 / length^2.
-    - `principal` [2]: k1 >= k2, in 1 / length.
-    """
-
-    mean: Float[Array, ""]
-    gaussian: Float[Array, ""]
-    principal: Float[Array, " 2"]
+from .._core import safe_divide, safe_norm, safe_normalize, tangents_to
+from ..shapes import Curvatures
 
 
 def inside(field: Callable, points: Float[Array, "*n 3"]) -> Bool[Array, "*n"]:
@@ -55,20 +42,6 @@ def curvatures(field: Callable, point: Float[Array, " 3"]) -> Curvatures:
     Source: R. Goldman, Curvature formulas for implicit curves and surfaces, 2005.
     """
     slope = gradient(field, point)
-    basis = _tangents(safe_normalize(slope))
+    basis = tangents_to(safe_normalize(slope))
     shape = safe_divide(basis @ hessian(field, point) @ basis.T, safe_norm(slope))
-    (a, b), (_, c) = shape
-    mean = (a + c) / 2
-    spread = safe_norm(jnp.stack([(a - c) / 2, b]))
-    return Curvatures(mean, a * c - b * b, jnp.stack([mean + spread, mean - spread]))
-
-
-def _tangents(n):
-    """Two unit vectors [2, 3] normal to n and to each other (Duff et al. 2017)."""
-    x, y, z = n
-    sign = jnp.where(z < 0, -1, 1).astype(n.dtype)
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = jnp.stack([1 + sign * x * x * a, sign * b, -sign * x])
-    second = jnp.stack([b, sign + y * y * a, -y])
-    return jnp.stack([first, second])
+    return Curvatures.of_form(shape)

@@ -113,8 +113,7 @@ def adaptive_dual_contouring(
     off = lax.stop_gradient(tolerance / jnp.max(grid.spacing)).astype(values.dtype)
     clusters = find_clusters(*fixed, off, levels)
     mesh = _merged_mesh(dual, hermite, planes, clusters, grid, weight, capacity)
-    out = finish(mesh, dual.needed, dual.bits.finite, capacity)
-    return out
+    return finish(mesh, dual.needed, dual.bits.finite, capacity)
 
 
 def _merged_mesh(

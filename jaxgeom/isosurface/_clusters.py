@@ -70,7 +70,9 @@ def find_clusters(
     clusters = Clusters(start, jnp.zeros_like(start))
 
     def grow(clusters, level):
-        tried = Clusters(_candidates(known, quads, level), clusters.level * 0 + level)
+        tried = Clusters(
+            _candidates(known, quads, level), jnp.full_like(clusters.level, level)
+        )
         merged = merge_planes(planes, tried, patches, grid)
         vertex = place_clusters(merged, tried, patches, grid, weight)
         far = _misfit(vertex, tried, hermite, dual, grid) > tolerance

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core import safe_divide, safe_norm, safe_normalize
+from .._core import safe_divide, safe_norm, safe_normalize, tangents_to
 from ..shapes import TriangleMesh
 from ._edge_list import boundary_vertices, edges
 from ._geometry import (
@@ -149,10 +149,8 @@ def _face_shape(triangle, normals, normal):
 
 
 def _frame(normal):
-    """Two unit tangents [2, 3]."""
-    axis = jnp.eye(3, dtype=normal.dtype)[jnp.argmin(jnp.abs(normal))]
-    first = safe_normalize(jnp.cross(axis, normal))
-    return jnp.stack([first, jnp.cross(normal, first)])
+    """Two unit tangents [2, 3]; zero where there is no normal."""
+    return jnp.where(jnp.any(normal != 0), tangents_to(normal), 0)
 
 
 def _into_plane(normal, tangents, face_normal, shape):

@@ -13,6 +13,7 @@ from ._knn import build as build
 from ._knn import knn as knn
 from ._rays import RayHits as RayHits
 from ._rays import cast_rays as cast_rays
+from ._signed import AbstractSign as AbstractSign
 from ._signed import Pseudonormal as Pseudonormal
 from ._signed import SignedDistance as SignedDistance
 from ._signed import Winding as Winding

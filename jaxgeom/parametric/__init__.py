@@ -44,7 +44,6 @@ from ._nurbs_shapes import nurbs_circle as nurbs_circle
 from ._nurbs_shapes import nurbs_revolution as nurbs_revolution
 from ._nurbs_shapes import nurbs_sphere as nurbs_sphere
 from ._nurbs_shapes import nurbs_torus as nurbs_torus
-from ._queries import Curvatures as Curvatures
 from ._queries import area as area
 from ._queries import area_element as area_element
 from ._queries import curvatures as curvatures

@@ -5,29 +5,16 @@ All for ONE (u, v); map over many with `jax.vmap`.
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import safe_divide, safe_norm, safe_normalize
+from ..shapes import Curvatures
 from ._abstract import AbstractSurface, floating
 from ._quadrature import rule
 
 _AT_POLE = 8
-
-
-class Curvatures(eqx.Module):
-    """How a surface bends at a point; positive where it bends away from its normal.
-
-    - `mean`: (k1 + k2) / 2, in 1 / length; 1 / r on a sphere.
-    - `gaussian`: k1 k2, in 1 / length^2.
-    - `principal` [2]: k1 >= k2, in 1 / length.
-    """
-
-    mean: Float[Array, ""]
-    gaussian: Float[Array, ""]
-    principal: Float[Array, " 2"]
 
 
 def tangents(surface: Callable, uv: Float[Array, " 2"]) -> Float[Array, "2 3"]:
@@ -90,9 +77,7 @@ def curvatures(surface: Callable, uv: Float[Array, " 2"]) -> Curvatures:
     skew = -safe_divide(jnp.dot(*rows), long * patch)
     first = jnp.stack([safe_divide(1, long), jnp.zeros_like(long)])
     basis = jnp.stack([first, jnp.stack([skew, safe_divide(long, patch)])])
-    (a, b), (_, c) = basis @ h @ basis.T
-    mean, spread = (a + c) / 2, safe_norm(jnp.stack([(a - c) / 2, b]))
-    return Curvatures(mean, a * c - b * b, jnp.stack([mean + spread, mean - spread]))
+    return Curvatures.of_form(basis @ h @ basis.T)
 
 
 def area(surface: AbstractSurface, *, cells=(8, 8), order: int = 8) -> Float[Array, ""]:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core import safe_normalize
+from .._core import safe_normalize, tangents_to
 from ..transforms import Affine, Rigid, Similarity
 
 
@@ -145,11 +145,8 @@ def yaw(axis: Float[Array, " 3"]) -> Float[Array, "6 4"]:
 def planar(normal: Float[Array, " 3"]) -> Float[Array, "6 3"]:
     """The basis of motions within planes of the given normal: one turn, two shifts."""
     n = _unit(normal)
-    # Two directions across the normal, from the axis it is least along.
-    first = jnp.cross(n, jnp.eye(3)[jnp.argmin(jnp.abs(n))])
-    across = jnp.stack([_unit(first), _unit(jnp.cross(n, first))], axis=1)
     turn = jnp.concatenate([n, jnp.zeros(3)])
-    shifts = jnp.concatenate([jnp.zeros((3, 2)), across])
+    shifts = jnp.concatenate([jnp.zeros((3, 2)), tangents_to(n).T])
     return jnp.concatenate([turn[:, None], shifts], axis=1)
 
 

@@ -1,7 +1,8 @@
-"""The nouns: point clouds, triangle and polygon meshes, grids."""
+"""The nouns: point clouds, triangle and polygon meshes, grids, curvatures."""
 
 from ._cloud import PointCloud as PointCloud
 from ._cloud import stack as stack
+from ._curvatures import Curvatures as Curvatures
 from ._grid import Grid as Grid
 from ._mesh import TriangleMesh as TriangleMesh
 from ._polygons import PolygonMesh as PolygonMesh

@@ -20,12 +20,9 @@ from jaxgeom.isosurface import (
 )
 from jaxgeom.shapes import Grid
 
-SHAPE = (9, 7, 11)
+from .hard_fields import SHAPE, noise
+
 PADDED = (11, 9, 13)
-
-
-def noise(seed=0, shape=SHAPE, dtype=np.float32):
-    return np.random.default_rng(seed).standard_normal(shape).astype(dtype)
 
 
 def weights(seed, shape, dtype=np.float32):

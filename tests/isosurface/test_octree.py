@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgeom._core import RESULTS, GeometryError
 from jaxgeom.fields import Box, Cylinder
 from jaxgeom.isosurface import (
     AdaptiveDualContouring,
@@ -20,25 +19,11 @@ from jaxgeom.meshes import topology
 from jaxgeom.shapes import Grid
 from jaxgeom.transforms import Rigid
 
-SHAPE = (9, 7, 11)
+from .hard_fields import SHAPE, noise, sheets, ties
+
 HALF = np.array([0.55, 0.4, 0.7])
 METHODS = [AdaptiveDualContouring(0.3, levels=3), DualGridCubes(0.3, levels=2)]
 NAMES = {"ids": lambda m: type(m).__name__}
-
-
-def noise(seed=0, shape=SHAPE, dtype=np.float32):
-    return np.random.default_rng(seed).standard_normal(shape).astype(dtype)
-
-
-def ties(seed=0):
-    return np.random.default_rng(seed).integers(-1, 2, SHAPE).astype(np.float32)
-
-
-def sheets():
-    """Walls thinner than a cell, in a general position."""
-    x = np.moveaxis(np.indices(SHAPE).astype(np.float32), 0, -1)
-    across = x @ np.array([0.31, 0.57, 0.43], np.float32)
-    return np.abs(across - np.round(across / 2.5) * 2.5) - 0.2
 
 
 def turned(body, dtype=np.float32):
@@ -74,17 +59,6 @@ def test_merging_keeps_the_topology_of_the_worst_fields(tools, _, fields):
         assert bool(new.is_manifold)
         before, after = before + fine.faces.shape[0], after + mesh.faces.shape[0]
     assert after < 0.9 * before
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("_, fields", FIELDS)
-def test_dual_grid_is_closed_on_the_worst_fields(tools, _, fields):
-    grid, method = tools.grid_of(SHAPE), DualGridCubes(0.3, levels=2)
-    for values in fields:
-        out = extract(values, grid, method=method, closed=True)
-        assert out.result == RESULTS.successful
-        tools.assert_closed(out.mesh)
-        assert bool(topology(out.mesh).is_manifold)
 
 
 @pytest.mark.slow
@@ -219,39 +193,3 @@ def test_derivatives_are_central_differences(x64, method):
         moved = lambda h, i=i, a=along: scalar(*at[:i], at[i] + h * a, *at[i + 1 :])
         expected = (moved(1e-7) - moved(-1e-7)) / 2e-7
         np.testing.assert_allclose(np.sum(slopes[i] * along), expected, rtol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS, **NAMES)
-def test_vmap_is_the_loop(tools, method):
-    grid, capacity = tools.grid_of(SHAPE), Capacity(1100, 2600)
-    one = lambda values: method(values, grid, capacity=capacity)
-    batch = np.stack([noise(8), noise(9) + 1.5, np.ones(SHAPE, np.float32)])
-    batched = jax.jit(jax.vmap(one))(batch)
-    for i, values in enumerate(batch):
-        expected = extract(values, grid, method=method)
-        got = jax.tree.map(lambda x, i=i: x[i], batched)
-        assert bool(got.result == expected.result)
-        mesh = got.mesh.trim()
-        np.testing.assert_array_equal(mesh.faces, expected.mesh.faces)
-        np.testing.assert_allclose(mesh.vertices, expected.mesh.vertices, atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS, **NAMES)
-def test_statuses(tools, method):
-    grid, values = tools.grid_of(SHAPE), noise(11)
-    values[[2, 4, 6], [3, 1, 5], [8, 2, 9]] = np.nan, np.inf, -np.inf
-    out = extract(values, grid, method=method, closed=True)
-    assert bool(out.result == RESULTS.nonfinite_input)
-    assert np.isfinite(out.mesh.vertices).all()
-    tools.assert_closed(out.mesh)
-    out = extract(np.ones(SHAPE, np.float32), grid, method=method)
-    assert bool(out.result == RESULTS.no_surface) and out.mesh.faces.shape == (0, 3)
-    out = jax.jit(method, static_argnames="capacity")(
-        noise(), grid, 0.0, capacity=Capacity(100, 200)
-    )
-    assert bool(out.result == RESULTS.capacity_exceeded)
-    assert (np.asarray(out.mesh.trim().faces) < 100).all()
-    with pytest.raises(GeometryError, match="values must have shape"):
-        method(noise(), tools.grid_of((9, 7, 12)), capacity=Capacity(9, 9))
