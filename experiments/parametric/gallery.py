@@ -99,7 +99,7 @@ def oval(t):
 
 def picture(mesh):
     """One body from above the front."""
-    camera = fields.Camera((1.9, -3.3, 2.1), field_of_view=30.0)
+    camera = fields.Camera((1.9, -3.3, 2.1), field_of_view=36.0)
     return render.render_mesh(mesh, camera, size=(SIZE, SIZE), samples=3)
 
 

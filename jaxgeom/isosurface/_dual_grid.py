@@ -215,19 +215,11 @@ def _tangents(values, grid, field):
     finite = jnp.isfinite(values)
     values = jnp.where(finite, values, 1)
     if field is None:
-        slopes = [_difference(values, d) / grid.spacing[d] for d in range(3)]
-        return values, jnp.stack(slopes)
+        slopes = jnp.gradient(values)
+        return values, jnp.stack(slopes) / grid.spacing[:, None, None, None]
     slopes = lax.map(jax.vmap(jax.vmap(jax.grad(field))), grid.nodes())
     sound = finite & jnp.all(jnp.isfinite(slopes), axis=-1)
     return values, jnp.moveaxis(jnp.where(sound[..., None], slopes, 0), -1, 0)
-
-
-def _difference(values, axis):
-    """Central differences of neighbors along an axis, one-sided at the ends."""
-    values = jnp.moveaxis(values, axis, 0)
-    inner = (values[2:] - values[:-2]) / 2
-    first, last = values[1:2] - values[:1], values[-1:] - values[-2:-1]
-    return jnp.moveaxis(jnp.concatenate([first, inner, last]), 0, axis)
 
 
 def _nodes(moments: Moments, off, grid: Grid, width, field, level) -> DualGrid:

@@ -106,7 +106,7 @@ def test_overflow_is_told_and_leaves_valid_faces(tools, method, short):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", SHARED + OCTREES, ids=lambda m: type(m).__name__)
 def test_vmap_is_the_loop(tools, method):
-    grid, capacity = tools.grid_of(SHAPE), Capacity(900, 2600)
+    grid, capacity = tools.grid_of(SHAPE), Capacity(1100, 2600)
     one = lambda values: method(values, grid, capacity=capacity)
     batch = np.stack([noise(8), noise(9) + 1.5, np.ones(SHAPE, np.float32)])
     batched = jax.jit(jax.vmap(one))(batch)
@@ -116,7 +116,9 @@ def test_vmap_is_the_loop(tools, method):
         assert bool(got.result == expected.result)
         mesh = got.mesh.trim()
         np.testing.assert_array_equal(mesh.faces, expected.mesh.faces)
-        np.testing.assert_allclose(mesh.vertices, expected.mesh.vertices, atol=1e-5)
+        # Fits of planes are solved to the rounding of coordinates over their weight.
+        near = 5e-7 / 0.01
+        np.testing.assert_allclose(mesh.vertices, expected.mesh.vertices, atol=near)
 
 
 @pytest.mark.parametrize("method", SHARED + OCTREES, ids=lambda m: type(m).__name__)
