@@ -1,8 +1,10 @@
 """Open surfaces: dense points and meshes of unsigned fields."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxgeom import RESULTS, Grid, learning, meshes
 
@@ -24,52 +26,62 @@ def bowl(p):
     return jnp.where(foot <= HEIGHT, jnp.abs(away - RADIUS), to_rim)
 
 
+class Lifted(eqx.Module):
+    """The bowl's distance and `lift` more: with lift > 0 there is no surface."""
+
+    lift: jax.Array
+
+    def __call__(self, p):
+        return bowl(p) + self.lift
+
+
+BOWL, NOTHING = Lifted(jnp.asarray(0.0)), Lifted(jnp.asarray(0.5))
+
+
 def test_a_bowl_becomes_a_disk_with_one_rim():
-    found = learning.open_surface(bowl, GRID)
+    found = learning.open_surface(BOWL, GRID)
     assert found.result == RESULTS.successful
-    mesh = meshes.orient(meshes.weld(found.mesh).mesh).mesh
-    about = meshes.topology(jax.tree.map(jnp.asarray, mesh))
+    mesh = jax.tree.map(jnp.asarray, found.mesh)
+    about = jax.jit(meshes.topology)(mesh)
     assert int(about.num_components) == 1
     assert int(about.euler) == 1
-    assert int(about.boundary_edges) > 20
-    away = jax.vmap(bowl)(jnp.asarray(found.mesh.vertices))
+    assert int(about.boundary_loops) == 1 and int(about.boundary_edges) > 20
+    assert int(about.nonmanifold_edges) == 0
+    away = jax.jit(jax.vmap(BOWL))(mesh.vertices)
     assert float(away.max()) < 0.02
-    used = meshes.face_areas(jax.tree.map(jnp.asarray, found.mesh)).sum()
     exact = 2 * np.pi * RADIUS * (RADIUS + HEIGHT)
-    assert abs(float(used) - exact) < 0.15 * exact
+    area = float(jax.jit(meshes.face_areas)(mesh).sum())
+    assert abs(area - exact) < 0.15 * exact
 
 
 def test_overflow_is_a_valid_prefix_and_no_surface_is_said():
-    full = learning.open_surface(bowl, GRID)
-    tight = jax.jit(lambda g: learning.open_surface_jit(bowl, g, capacity=(40, 30)))(
-        GRID
-    )
-    assert tight.result == RESULTS.capacity_exceeded
-    assert int(tight.required_vertices) == int(full.required_vertices)
-    mesh = tight.mesh.trim()
-    assert mesh.faces.size and mesh.faces.max() < len(mesh.vertices)
-    nothing = learning.open_surface(lambda p: bowl(p) + 0.5, GRID)
-    assert nothing.result == RESULTS.no_surface
-    assert nothing.mesh.faces.shape[0] == 0
+    capacity = (40, 30)
+    tight = jax.jit(lambda f: learning.open_surface_jit(f, GRID, capacity=capacity))
+    short, none = tight(BOWL), tight(NOTHING)
+    assert short.result == RESULTS.capacity_exceeded
+    assert int(short.required_vertices) > 100 and int(short.required_faces) > 200
+    mesh = short.mesh.trim()
+    assert len(mesh.vertices) == 40
+    assert 0 < len(mesh.faces) <= 60 and mesh.faces.max() < 40
+    assert none.result == RESULTS.no_surface
+    assert int(none.mesh.num_faces) == 0 and np.all(np.isfinite(none.mesh.vertices))
 
 
 def test_dense_points_cover_the_bowl():
     dense = jax.jit(
-        lambda g, k: learning.dense_points(bowl, g, 600, key=k, tolerance=0.002)
+        lambda f, k: learning.dense_points(f, GRID, 600, key=k, tolerance=0.002)
     )
-    out = dense(GRID, jax.random.key(2))
+    out = dense(BOWL, jax.random.key(2))
     points = np.asarray(out.cloud.trim().points)
     assert out.result == RESULTS.successful and len(points) > 500
-    assert float(jax.vmap(bowl)(jnp.asarray(points)).max()) <= 0.002
+    assert len(points) == int(out.num_points)
+    assert float(jax.vmap(bowl)(jnp.asarray(points)).max()) <= 0.0021
     assert points[:, 2].min() < -0.37 and points[:, 2].max() > HEIGHT - 0.03
-    far = jax.jit(
-        lambda g, k: learning.dense_points(
-            lambda p: bowl(p) + 0.5, g, 50, key=k, tolerance=0.002
-        )
-    )(GRID, jax.random.key(2))
+    far = dense(NOTHING, jax.random.key(2))
     assert far.result == RESULTS.no_surface and np.all(np.isfinite(far.cloud.points))
 
 
+@pytest.mark.slow
 def test_samples_know_their_distance():
     ball = meshes.icosphere(2)
     ball = jax.tree.map(jnp.asarray, ball)
