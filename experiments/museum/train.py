@@ -13,7 +13,7 @@ import jax
 from jaxgeom import io, learning
 
 SHAPES, SAMPLES, CODE, WIDTH = 256, 6000, 16, 96
-STEPS = 6000
+STEPS, ENCODER_STEPS = 6000, 4000
 
 
 def models():
@@ -31,20 +31,33 @@ def main(folder):
     samples, clouds = figures.lessons(SHAPES, SAMPLES, seed=100)
     print(f"{SHAPES} shapes with {SAMPLES} distances each: {time.time() - began:.0f} s")
     family, pair = models()
+    loss = learning.FamilyLoss(clamp=0.1, prior=1e-4)
     adam = learning.Adam(num_steps=STEPS, rate=3e-3)
-    tell = lambda done, loss: done % 1000 or print(f"  step {done}: loss {loss:.4f}")
-    jobs = {
-        "family": (family, learning.FamilyLoss(clamp=0.1, prior=1e-4), samples),
-        "encoder": (pair, learning.EncodedLoss(clamp=0.1), (samples, clouds)),
-    }
-    for name, (model, loss, data) in jobs.items():
-        began = time.time()
-        out = learning.train(
-            model, loss, data, key=jax.random.key(2), adam=adam, progress=tell
-        )
-        io.save_weights(folder / f"{name}.npz", out.model)
-        last = float(out.losses[-200:].mean())
-        print(f"{name}: {time.time() - began:.0f} s, loss {last:.4f}")
+    family = taught(folder / "family.npz", family, loss, samples, adam)
+    train_encoder(folder, family, pair, samples, clouds)
+
+
+def train_encoder(folder, family, pair, samples, clouds):
+    """The encoder, with the decoder of the family to start from.
+
+    From a blank decoder it does not learn: both settle on the mean figure.
+    """
+    pair = learning.EncodedFamily(pair.encoder, family.decoder)
+    loss = learning.EncodedLoss(clamp=0.1)
+    adam = learning.Adam(num_steps=ENCODER_STEPS, rate=1e-3)
+    taught(folder / "encoder.npz", pair, loss, (samples, clouds), adam)
+
+
+def taught(path, model, loss, data, adam):
+    """The model after training, saved."""
+    began = time.time()
+    tell = lambda done, value: done % 1000 or print(f"  step {done}: {value:.4f}")
+    key = jax.random.key(2)
+    out = learning.train(model, loss, data, key=key, adam=adam, progress=tell)
+    io.save_weights(path, out.model)
+    last = float(out.losses[-200:].mean())
+    print(f"{path.name}: {time.time() - began:.0f} s, loss {last:.4f}")
+    return out.model
 
 
 if __name__ == "__main__":
