@@ -67,9 +67,8 @@ def main(folder):
         )
         loss = learning.DistanceLoss(clamp=0.1, batch=4096)
         began = time.time()
-        out = learning.train(
-            net, loss, samples, key=KEY, adam=learning.Adam(num_steps=3000)
-        )
+        adam = learning.Adam(num_steps=1500, rate=1e-3)
+        out = learning.train(net, loss, samples, key=KEY, adam=adam)
         print(f"\n{name}: trained in {time.time() - began:.0f} s")
         report(name, out.model, truth, folder)
 

@@ -126,13 +126,13 @@ def test_a_family_explains_a_new_half_cloud():
     out = learning.train(family, learning.FamilyLoss(), samples, key=KEY, adam=adam)
     assert out.result == RESULTS.successful
     encoder = learning.PointEncoder.create(4, key=KEY, width=32)
-    pair = learning.EncodedFamily(encoder, decoder)
+    pair = learning.EncodedFamily(encoder, out.model.decoder)
     given = (samples, clouds)
     one_pass = learning.train(
         pair, learning.EncodedLoss(), given, key=KEY, adam=adam
     ).model
     _, fresh, axes = _eggs(6, 77)
-    half = PointCloud(fresh.points, fresh.normals, fresh.points[..., 0] > 0)
+    half = eqx.tree_at(lambda c: c.mask, fresh, fresh.points[..., 0] > 0)
 
     @jax.jit
     def errors(cloud, a, key):
