@@ -3,10 +3,13 @@
     python experiments/isosurface/euler.py
 
 White noise on 6^3 nodes, 200 times, closed by a layer outside; the truth is marching
-cubes of the interpolant sampled 8 times as finely. Prints the share of equal Euler
-characteristics, and the mean difference, without and with the asymptotic decider; then
-the same for fields of waves, which are smoother.
+cubes of the interpolant sampled 12 times as finely, and 64 times where that differs
+from the last rule: a tunnel may be thinner than a sample. Prints for each rule the
+share of equal Euler characteristics, and the mean difference; then the same for fields
+of waves, which are smoother.
 """
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +20,14 @@ from jaxgeom.isosurface import (
     Capacity,
     MarchingCubes,
     SeparateInside,
+    TrilinearDecider,
     pad_outside,
 )
-from jaxgeom.linear import interpolate
 from jaxgeom.meshes import topology
 from jaxgeom.shapes import Grid
 
-NODES, FINER, FIELDS = 6, 8, 200
+NODES, FIELDS, COARSE, FINE = 6, 200, 12, 64
+LABELS = ("SeparateInside", "AsymptoticDecider", "TrilinearDecider")
 
 
 def waves(rng):
@@ -44,19 +48,29 @@ def euler(values, ambiguity, capacity):
     return topology(method(values, grid, capacity=capacity).mesh).euler
 
 
-@jax.jit
-def three(values):
-    """The truth, without and with the decider."""
+@functools.partial(jax.jit, static_argnames="finer")
+def truth(values, finer):
+    """Of the interpolant, sampled `finer` times as finely."""
     unit = Grid(jnp.zeros(3), jnp.ones(3), values.shape)
     values, _ = pad_outside(values, unit)
-    count = (NODES + 1) * FINER + 1
-    axis = jnp.arange(count) / FINER
-    at = jnp.stack(jnp.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    fine = interpolate(values, at.reshape(-1, 3)).reshape((count,) * 3)
-    truth = euler(fine, AsymptoticDecider(), Capacity(60_000, 120_000))
-    coarse = Capacity(700, 1600)
-    plain = euler(values, SeparateInside(), coarse)
-    return truth, plain, euler(values, AsymptoticDecider(), coarse)
+    count = (NODES + 1) * finer + 1
+    axis = jnp.arange(count) / finer
+    for d in range(3):
+        low = jnp.minimum(jnp.arange(count) // finer, NODES)
+        t = (axis - low).reshape(*[-1 if k == d else 1 for k in range(3)])
+        below, above = (jnp.take(values, low + k, axis=d) for k in (0, 1))
+        values = below + t * (above - below)
+    size = 1500 * finer**2
+    return euler(values, AsymptoticDecider(), Capacity(size, 2 * size))
+
+
+@jax.jit
+def by_rule(values):
+    """What each rule gives."""
+    unit = Grid(jnp.zeros(3), jnp.ones(3), values.shape)
+    values, _ = pad_outside(values, unit)
+    rules = (SeparateInside(), AsymptoticDecider(), TrilinearDecider())
+    return jnp.stack([euler(values, rule, Capacity(700, 1600)) for rule in rules])
 
 
 def main():
@@ -67,9 +81,13 @@ def main():
         "waves": lambda: waves(rng),
     }
     for kind, make in kinds.items():
-        found = np.array([three(jnp.float32(make())) for _ in range(FIELDS)])
-        for label, column in (("separate", 1), ("decider", 2)):
-            gap = found[:, column] - found[:, 0]
+        fields = [jnp.float32(make()) for _ in range(FIELDS)]
+        found = np.array([by_rule(f) for f in fields])
+        true = np.array([truth(f, COARSE) for f in fields])
+        for i in np.nonzero(found[:, 2] != true)[0]:
+            true[i] = truth(fields[i], FINE)
+        for label, column in zip(LABELS, found.T, strict=True):
+            gap = column - true
             print(f"{kind}, {label}: {np.mean(gap == 0):.3f} equal, {gap.mean():+.2f}")
 
 

@@ -4,7 +4,9 @@ from ._adaptive import AdaptiveDualContouring as AdaptiveDualContouring
 from ._adaptive import adaptive_dual_contouring as adaptive_dual_contouring
 from ._ambiguity import AbstractFaceRule as AbstractFaceRule
 from ._ambiguity import AsymptoticDecider as AsymptoticDecider
+from ._ambiguity import Decisions as Decisions
 from ._ambiguity import SeparateInside as SeparateInside
+from ._ambiguity import TrilinearDecider as TrilinearDecider
 from ._brick_cubes import count_on_bricks as count_on_bricks
 from ._brick_cubes import marching_cubes_on_bricks as marching_cubes_on_bricks
 from ._classify import Counts as Counts

@@ -5,6 +5,8 @@ bits. Edges, faces and cells belong to the brick of their lowest node, so that w
 bricks share is decided once.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,8 +31,9 @@ class BrickBits(eqx.Module):
 
     - `inside`: [b, 9, 9], the signs of 9 nodes along z.
     - `words`: [64 b], per row the cut edges along x, y, z and the active cells, 8 bits
-      each; `joined`: the faces whose inside corners are connected, by normal axis, or
-      None.
+      each; `joined`: the faces whose inside corners are connected, by normal axis;
+      `tunnels`: the cells through which the inside (lowest 8 bits) or the outside runs;
+      None where that is never so.
     - `first_vertex`: [64 b], the number of the first vertex of every row.
     - `neighbors`: [8 b], where the bricks ahead are stored: entry c of a brick, c =
       x + 2 y + 4 z; b for bricks that are not.
@@ -41,6 +44,7 @@ class BrickBits(eqx.Module):
     inside: UInt[Array, "b n n"]
     words: UInt[Array, " m"]
     joined: UInt[Array, " m"] | None
+    tunnels: UInt[Array, " m"] | None
     first_vertex: Int[Array, " m"]
     neighbors: Int[Array, " k"]
     faces: Int[Array, " b"]
@@ -84,13 +88,15 @@ def classify_bricks(
     exist = _exist(band, real)
     words, unclear, corners = stage(token, _words, inside, exist, gaps)
     faces = stage(token, _faces, corners, words)
-    decided = _decided(rule, band.values, token)
-    joined = None
-    if decided is not None:
-        joined = decided & unclear
+    joined, tunnels = _decided(rule, band.values, token)
+    if joined is not None:
+        joined = joined & unclear
         # A join leaves at most one loop fewer, two triangles more, in either cell.
-        bits = popcount(joined).reshape(-1, ROWS)
-        faces = faces + 4 * jnp.sum(bits, axis=1)
+        faces = faces + 4 * _per_brick(joined)
+    if tunnels is not None:
+        tunnels = tunnels & (active_cells(words) * jnp.uint32(1 + (1 << SIZE)))
+        # A tube between two loops has four triangles more than two discs.
+        faces = faces + 4 * _per_brick(tunnels)
     vertices = popcount(cut_edges(words))
     total = lambda x: jnp.sum(x, dtype=jnp.int32)
     cells = total(popcount(active_cells(words)))
@@ -99,6 +105,7 @@ def classify_bricks(
         inside,
         words,
         joined,
+        tunnels,
         stage(token, prefix_sum, vertices),
         ahead.reshape(-1),
         faces,
@@ -106,6 +113,11 @@ def classify_bricks(
         jnp.any(gaps),
         needed,
     )
+
+
+def _per_brick(words):
+    """The number of bits of every brick."""
+    return jnp.sum(popcount(words).reshape(-1, ROWS), axis=1)
 
 
 def _bricks_ahead(band):
@@ -237,13 +249,22 @@ def _faces(corners, words):
     return jax.vmap(count_faces)([split(c) for c in corners], cells)
 
 
-def _decided(rule, values, token) -> UInt[Array, " m"] | None:
-    """The faces that the rule connects, by rows; None for none at all."""
+def _decided(rule, values, token):
+    """The faces that the rule connects and its tunnels, by rows; None for none."""
     zero = jnp.zeros((), values.dtype)
-    one = lambda v: rule.joined(v, zero, None)
-    if jax.eval_shape(one, values[0]) is None:
-        return None
+    one = lambda v: rule(v, zero, None)
+    found = jax.eval_shape(one, values[0])
+    if not jax.tree.leaves(found):
+        return None, None
     # Each brick is packed into words of 32 along z; the first 8 bits are its own.
     bits = stage(token, lambda v: lax.map(one, v, batch_size=64), values)
-    own = bits[:, :, :SIZE, :SIZE, 0] & jnp.uint32(_LOW)
-    return _triple(*(own[:, axis].reshape(-1) for axis in range(3)))
+    return _rows(bits.joined), _rows(bits.tunnels)
+
+
+def _rows(words) -> UInt[Array, " m"] | None:
+    """The bits of rows, 8 for each of the kinds that the second axis counts."""
+    if words is None:
+        return None
+    own = words[:, :, :SIZE, :SIZE, 0] & jnp.uint32(_LOW)
+    kinds = [own[:, k].reshape(-1) << SIZE * k for k in range(own.shape[1])]
+    return functools.reduce(jnp.bitwise_or, kinds)

@@ -8,8 +8,8 @@ from .._core import prefix_sum, stage
 from ._bits import Owners, expand, expand_filled, popcount, select
 from ._brick_bits import SIZE, BrickBits, active_cells
 from ._extraction import Capacity
-from ._faces import Faces
-from ._tables import CODE_BITS, CaseTables, case_tables, decided_tables
+from ._faces import Faces, through
+from ._tables import CODE_BITS, CaseTables, tables_for
 
 
 class BrickCells(eqx.Module):
@@ -35,7 +35,7 @@ def emit_brick_faces(
     counts = popcount(active_cells(words))
     starts = stage(token, prefix_sum, counts)
     owners = expand(counts, starts, capacity.cells, token)
-    tables = case_tables() if bits.joined is None else decided_tables()
+    tables = tables_for(bits.joined, bits.tunnels)
     total = starts[-1] + counts[-1]
     place = stage(token, lambda o, b: _places(o, b, rows, tables), owners, bits)
     cells = stage(token, lambda p: _cells(*p, total, limit, capacity, tables), place)
@@ -57,6 +57,9 @@ def _places(owners: Owners, bits, rows, tables: CaseTables):
     case = _case(bits.inside, word, bit)
     if tables.row is not None:
         case = jnp.asarray(tables.row)[case << 6 | _joined(bits, word, bit)]
+    if tables.tunnel is not None:
+        words = bits.tunnels.at[word].get(mode="clip")
+        case = jnp.asarray(tables.tunnel)[3 * case + through(words, words >> SIZE, bit)]
     return word, bit, case
 
 

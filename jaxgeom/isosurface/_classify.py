@@ -25,7 +25,8 @@ class Bits(eqx.Module):
     """The inside nodes, the cut edges along each axis, and the active cells.
 
     `joined`: by normal axis, the ambiguous faces whose inside corners are connected;
-    None where that is never so.
+    `tunnels`: the cells through which the inside or the outside runs between two pieces
+    of surface; None where that is never so.
     """
 
     inside: UInt[Array, "x y w"]
@@ -33,6 +34,7 @@ class Bits(eqx.Module):
     cells: UInt[Array, "x y w"]
     finite: Bool[Array, ""]
     joined: UInt[Array, "3 x y w"] | None = None
+    tunnels: UInt[Array, "2 x y w"] | None = None
 
 
 class Numbers(eqx.Module):
@@ -58,12 +60,17 @@ def classify(
     bits = stage(token, lambda i, f: _bits(i, f, nz), inside, finite)
     corners = stage(token, corner_words, bits.inside)
     num_faces = stage(token, count_faces, corners, bits.cells)
-    decided = rule.joined(values, level, token)
-    if decided is not None:
-        joined = stage(token, _on_ambiguous, decided, corners, bits.inside)
+    decided = rule(values, level, token)
+    if decided.joined is not None:
+        joined = stage(token, _on_ambiguous, decided.joined, corners, bits.inside)
         bits = eqx.tree_at(lambda b: b.joined, bits, joined, is_leaf=_is_none)
         # A join leaves at most one loop fewer, two triangles more, in either cell.
         num_faces = num_faces + 4 * jnp.sum(popcount(joined))
+    if decided.tunnels is not None:
+        tunnels = decided.tunnels & bits.cells
+        bits = eqx.tree_at(lambda b: b.tunnels, bits, tunnels, is_leaf=_is_none)
+        # A tube between two loops has four triangles more than two discs.
+        num_faces = num_faces + 4 * jnp.sum(popcount(tunnels))
     return bits, stage(token, _number, bits, num_faces)
 
 

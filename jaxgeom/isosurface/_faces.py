@@ -8,7 +8,7 @@ from .._core import prefix_sum, stage
 from ._bits import WORD, Owners, below, expand, expand_filled, popcount, select
 from ._classify import Bits, Numbers
 from ._extraction import Capacity
-from ._tables import CODE_BITS, CaseTables, case_tables, decided_tables
+from ._tables import CODE_BITS, CaseTables, tables_for
 
 _BIT = WORD.bit_length() - 1
 
@@ -37,7 +37,7 @@ def emit_faces(bits: Bits, numbers: Numbers, capacity: Capacity, token) -> Faces
     """The faces of the active cells, in the order of the cells."""
     first, size = numbers.first_cell, capacity.cells
     owners = expand(numbers.cells, first, size, token)
-    tables = case_tables() if bits.joined is None else decided_tables()
+    tables = tables_for(bits.joined, bits.tunnels)
     place = stage(token, lambda o, b: _places(o, b, tables), owners, bits)
     cells = stage(
         token, lambda p, n: _cells(*p, n, bits, capacity, tables), place, numbers
@@ -60,7 +60,17 @@ def _places(owners: Owners, bits, tables: CaseTables):
         row = jnp.asarray(tables.row)[
             row << 6 | _joined(bits.joined, owners.owner, bit)
         ]
+    if tables.tunnel is not None:
+        flat = bits.tunnels.reshape(2, -1)
+        inside, outside = (w.at[owners.owner].get(mode="clip") for w in flat)
+        row = jnp.asarray(tables.tunnel)[3 * row + through(inside, outside, bit)]
     return owners.owner, bit | row << _BIT
+
+
+def through(inside, outside, bit):
+    """Which side runs through: 0 for neither, 1 for the inside, 2 for the outside."""
+    one = lambda words: (words >> bit.astype(jnp.uint32) & 1).astype(int)
+    return one(inside) | one(outside) << 1
 
 
 def _joined(joined, word, bit):

@@ -13,6 +13,7 @@ from jaxgeom.isosurface import (
     AsymptoticDecider,
     Capacity,
     MarchingCubes,
+    TrilinearDecider,
     extract,
     marching_cubes_on_bricks,
 )
@@ -59,7 +60,11 @@ def assert_same(mesh, other, grid):
 
 @pytest.mark.parametrize("kind", ["noise", "ties"])
 @pytest.mark.parametrize(
-    "ambiguity", [pytest.param(None, marks=pytest.mark.slow), AsymptoticDecider()]
+    "ambiguity",
+    [
+        TrilinearDecider(),
+        *(pytest.param(r, marks=pytest.mark.slow) for r in (None, AsymptoticDecider())),
+    ],
 )
 def test_white_noise_and_ties_give_the_dense_mesh(kind, ambiguity):
     rng = np.random.default_rng(0)

@@ -1,18 +1,25 @@
 """The strongest predicate: closed, edge-manifold, oriented, on the worst of fields."""
 
+import itertools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxgeom._core import RESULTS
 from jaxgeom.isosurface import (
+    AsymptoticDecider,
     Capacity,
     Cubic,
     MarchingCubes,
+    TrilinearDecider,
     count,
     extract,
     marching_cubes,
 )
+from jaxgeom.meshes import topology
+from jaxgeom.shapes import Grid
 
 # Each shape compiles its own programs: three of six are left to the slow run.
 _MORE = [(2, 5, 33), (270, 3, 4), (5, 6, 64)]
@@ -38,13 +45,47 @@ def test_closed_after_padding(tools, shape, field):
         tools.assert_closed(out.mesh)
 
 
-def test_closed_with_cubic_placement(tools):
-    method = MarchingCubes(placement=Cubic())
-    for field in (noise, ties):
-        out = extract(
-            field((9, 7, 11)), tools.grid_of((9, 7, 11)), method=method, closed=True
-        )
+@pytest.mark.parametrize("decider", [AsymptoticDecider(), TrilinearDecider()])
+def test_closed_with_deciders_and_cubic_placement(tools, decider):
+    method = MarchingCubes(placement=Cubic(), ambiguity=decider)
+    for field, seed in itertools.product((noise, ties), range(6)):
+        values = field((9, 7, 11), seed)
+        out = extract(values, tools.grid_of(values.shape), method=method, closed=True)
         tools.assert_closed(out.mesh)
+
+
+@jax.jit
+def _euler_numbers(cell):
+    """Of a cell by its faces, by tunnels too, and of its interpolant at 33^3 nodes."""
+    fine = cell
+    for axis in range(3):
+        t = jnp.linspace(0, 1, 33).reshape([-1 if d == axis else 1 for d in range(3)])
+        low, high = (jnp.take(fine, jnp.array([k]), axis) for k in (0, 1))
+        fine = (1 - t) * low + t * high
+
+    def euler(values, rule, capacity):
+        grid = Grid(jnp.zeros(3), jnp.ones(3), values.shape)
+        settings = dict(capacity=capacity, ambiguity=rule, normals=False)
+        return topology(marching_cubes(values, grid, **settings).mesh).euler
+
+    coarse, small = Capacity(12, 20), Capacity(16_000, 32_000)
+    return jnp.stack(
+        [
+            euler(cell, AsymptoticDecider(), coarse),
+            euler(cell, TrilinearDecider(), coarse),
+            euler(fine, AsymptoticDecider(), small),
+        ]
+    )
+
+
+@pytest.mark.slow
+def test_the_topology_is_that_of_the_trilinear_interpolant():
+    rng = np.random.default_rng(0)
+    cells = np.exp(rng.standard_normal((1500, 2, 2, 2)))
+    cells *= rng.choice([-1, 1], cells.shape)
+    by_faces, both, true = jax.lax.map(_euler_numbers, jnp.float32(cells)).T
+    np.testing.assert_array_equal(both, true)
+    assert np.sum(by_faces != both) >= 10
 
 
 def test_all_sign_patterns_of_a_cell(tools):
