@@ -85,7 +85,7 @@ def evaluated(found, truth):
     return meshes.evaluate(found, truth, key=KEY, num=20_000)
 
 
-def padded(m, vertices=9000, faces=18000):
+def padded(m, vertices=20000, faces=40000):
     """The mesh in arrays of one size, so that all are compared by one program."""
     v, f = len(m.vertices), len(m.faces)
     points = np.zeros((vertices, 3), np.float32)
