@@ -67,10 +67,18 @@ def _without_frequencies(along):
 
 
 # The others are made of the same parts.
-_QUICK = ("surface", "distance", "family", "code")
+_QUICK = ("surface", "code")
 _MEMBERS = [
     name if name in _QUICK else pytest.param(name, marks=pytest.mark.slow)
-    for name in (*_QUICK, "bare surface", "unsigned", "occupancy", "encoded")
+    for name in (
+        *_QUICK,
+        "distance",
+        "family",
+        "bare surface",
+        "unsigned",
+        "occupancy",
+        "encoded",
+    )
 ]
 
 

@@ -38,6 +38,7 @@ class Lifted(eqx.Module):
 BOWL, NOTHING = Lifted(jnp.asarray(0.0)), Lifted(jnp.asarray(0.5))
 
 
+@pytest.mark.slow
 def test_a_bowl_becomes_a_disk_with_one_rim():
     found = learning.open_surface(BOWL, GRID)
     assert found.result == RESULTS.successful
@@ -54,6 +55,7 @@ def test_a_bowl_becomes_a_disk_with_one_rim():
     assert abs(area - exact) < 0.15 * exact
 
 
+@pytest.mark.slow
 def test_overflow_is_a_valid_prefix_and_no_surface_is_said():
     capacity = (40, 30)
     tight = jax.jit(lambda f: learning.open_surface_jit(f, GRID, capacity=capacity))

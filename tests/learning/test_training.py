@@ -82,6 +82,7 @@ def test_training_is_one_program_and_depends_on_the_key_alone():
     assert float(first.losses[-10:].mean()) < 0.7 * float(first.losses[:10].mean())
 
 
+@pytest.mark.slow
 def test_a_batch_of_shapes_is_a_loop_of_shapes():
     nets = [learning.NeuralField.siren(key=jax.random.key(s), **SMALL) for s in (1, 2)]
     clouds = [CLOUD, _single(ellipsoid_cloud(seed=9))]
