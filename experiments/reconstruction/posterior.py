@@ -4,11 +4,12 @@
 
 For each oriented scan, 5 000 of its points. First the cost on 64^3 nodes: mean and 32
 samples, seconds of the first call and of the next, and the peak memory of the process.
-Then calibration, 2 000 points and 40^3 nodes: length, variance and noise are those that make the
-normals of 24 held-out points most likely, found by gradient steps; of 200 points that
-neither has seen, the share whose normal components lie within the 90 % interval of the
-prediction (noise included), and the share where the field is zero within its own 90 %
-interval. The picture shows a slice: mean, deviation, probability inside.
+Then calibration, 2 000 points and 40^3 nodes: length, variance and noise are those that
+make the normals of 24 held-out points most likely, found by gradient steps; of 200
+points that neither has seen, the share whose normal components lie within the 90 %
+interval of the prediction (noise included), and the share where the field is zero
+within its own 90 % interval. The picture shows a slice: mean, deviation, probability
+inside.
 """
 
 import argparse

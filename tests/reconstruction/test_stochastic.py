@@ -74,7 +74,10 @@ def dense_posterior(cloud, grid, points, kernel, noise, variance):
     return mean, prior - known
 
 
-@pytest.mark.parametrize("kernel", [Matern(1.1), SquaredExponential(0.8)])
+@pytest.mark.parametrize(
+    "kernel",
+    [Matern(1.1), pytest.param(SquaredExponential(0.8), marks=pytest.mark.slow)],
+)
 def test_mean_and_deviation_are_those_of_dense_algebra(x64, kernel):
     cloud, grid, points = small()
     found = _run(cloud, grid, kernel)
@@ -102,6 +105,7 @@ def _run(cloud, grid, kernel):
     return stochastic_poisson(cloud, grid, kernel=kernel, **SETTINGS)
 
 
+@pytest.mark.slow
 def test_samples_have_the_mean_and_the_covariance(x64):
     cloud, grid, points = small()
     found = _run(cloud, grid, Matern(1.1))
@@ -179,6 +183,7 @@ def test_padding_has_no_influence(x64):
     assert np.all(np.asarray(slope[6:]) == 0) and np.any(np.asarray(slope[:6]) != 0)
 
 
+@pytest.mark.slow
 def test_vmap_is_the_loop(x64):
     clouds = [small(seed)[0] for seed in range(3)]
     grid, points = small()[1:]
