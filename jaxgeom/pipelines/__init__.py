@@ -3,6 +3,7 @@
 from ._find_start import find_start as find_start
 from ._fuse import Fusion as Fusion
 from ._fuse import fuse as fuse
+from ._iterated import IteratedPoisson as IteratedPoisson
 from ._memory import memory_needed as memory_needed
 from ._prepare import prepare as prepare
 from ._pyramid import Pyramid as Pyramid
