@@ -31,12 +31,12 @@ from jaxgeom.shapes import PointCloud
 
 METHODS = {
     "planes": LocalPlanes(),
-    "winding-64": WindingConsistency(),
-    "winding-128": WindingConsistency(resolution=128, levels=3),
-    "winding-128, k=12": WindingConsistency(resolution=128, levels=3, k=12),
+    "winding-64, k=None": WindingConsistency(resolution=64, levels=2, k=None),
+    "winding-128, k=None": WindingConsistency(k=None),
+    "winding-128": WindingConsistency(),
     "iterated-64": IteratedPoisson(),
     "iterated-128": IteratedPoisson(
-        WindingConsistency(resolution=64), resolution=128, rounds=15
+        WindingConsistency(resolution=64, levels=2), resolution=128
     ),
 }
 

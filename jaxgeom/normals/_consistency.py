@@ -50,20 +50,21 @@ class WindingConsistency(AbstractOrientation):
 
     Dipoles are improved on grids of 2^-levels resolution up to `resolution` nodes a
     side, `steps` times on each, with a kernel `width` spacings wide. The cost grows
-    with the grid, not with the square of the points. The normal is the direction in
-    which the winding number falls; with `k`, that of the plane through k neighbors
-    turned to this side. It starts from nothing: the same points give the same normals.
+    with the grid, not with the square of the points. The normal is that of the plane
+    through k neighbors, turned to the side to which the winding number falls; for `k`
+    None it is the direction of this fall, which is blurred by the kernel. It starts
+    from nothing: the same points give the same normals.
     Constant under differentiation.
 
     Source: Lin, Shi, Liu, Fast and globally consistent normal orientation based on the
     winding number normal consistency, ACM TOG 2024.
     """
 
-    resolution: int = eqx.field(static=True, default=64)
-    levels: int = eqx.field(static=True, default=2)
+    resolution: int = eqx.field(static=True, default=128)
+    levels: int = eqx.field(static=True, default=3)
     steps: int = eqx.field(static=True, default=15)
     width: float = 1.0
-    k: int | None = eqx.field(static=True, default=None)
+    k: int | None = eqx.field(static=True, default=12)
 
     def __call__(self, cloud):
         return self.measured(cloud).cloud

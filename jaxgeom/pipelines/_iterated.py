@@ -33,7 +33,7 @@ class IteratedPoisson(AbstractOrientation):
     def __call__(self, cloud):
         points = jax.lax.stop_gradient(cloud.washed().points)
         cloud = eqx.tree_at(lambda c: c.points, cloud, points)
-        start = self.start or WindingConsistency(resolution=self.resolution)
+        start = self.start or WindingConsistency(resolution=self.resolution, levels=2)
         grid = Grid.around(cloud, resolution=self.resolution)
         q = grid.index_of(cloud.points)
         count = jnp.maximum(jnp.sum(cloud.mask), 1)

@@ -14,7 +14,7 @@ from jaxgeom.shapes import PointCloud
 
 # A torus of unequal widths, off the origin: 600 points in a cloud of 700.
 N, CAPACITY = 600, 700
-METHOD = WindingConsistency(resolution=32, levels=1, steps=6)
+METHOD = WindingConsistency(resolution=32, levels=1, steps=6, k=None)
 
 
 @eqx.filter_jit
