@@ -74,7 +74,8 @@ def main():
             f"{len(out.mesh.vertices)} vertices, {len(out.mesh.faces)} faces"
         )
     if arguments.check:
-        print(topology(out.mesh))
+        found = vars(topology(out.mesh)).items()
+        print("  " + ", ".join(f"{name} {int(value)}" for name, value in found))
 
 
 if __name__ == "__main__":

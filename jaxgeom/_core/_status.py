@@ -17,6 +17,7 @@ class RESULTS(optx.RESULTS):
     no_consensus = "Too few pairs of points agree on one transform."
     no_overlap = "No source point has a target point within the allowed distance."
     too_few_matches = "Fewer pairs of points than the alignment needs."
+    diverged = "Training met a loss that is not finite, or ended above its start."
     not_converged = "The solver stopped before the residual fell below rtol."
 
 

@@ -15,6 +15,8 @@ from .._core import (
     bucket,
     failure_where,
     first_failure,
+    from_host,
+    host_zeros,
     message,
 )
 from ..shapes import Grid
@@ -103,7 +105,7 @@ class NarrowBand(eqx.Module):
         return NarrowBand(
             sampler.grid,
             jnp.asarray(padded),
-            _stacked(values, size, sampler.grid.origin.dtype),
+            values,
             count,
             count,
             failure_where(count == 0, RESULTS.no_surface),
@@ -217,25 +219,17 @@ def _tested(sampler, boxes, size):
 
 
 def _sampled(sampler, bricks):
-    """The bricks that hold surface, and their values as a list of arrays."""
-    kept, values = [bricks[:0]], []
+    """The bricks that hold surface, and the values of a bucket of them."""
+    kept, at = [bricks[:0]], 0
+    shape = (bucket(len(bricks)), NODES, NODES, NODES)
+    values = host_zeros(shape, sampler.grid.origin.dtype)
     for i in range(0, len(bricks), _BRICKS):
         found, near = _values(sampler, _rows(bricks, i, _BRICKS))
         chosen = np.flatnonzero(np.asarray(near)[: len(bricks) - i])
         kept.append(bricks[i + chosen])
-        values.append(np.asarray(found)[chosen])
-    return np.concatenate(kept), values
-
-
-def _stacked(parts, size, dtype):
-    """The rows of all parts in one array of `size` rows; empties the list."""
-    out = np.zeros((size, NODES, NODES, NODES), dtype)
-    at = 0
-    while parts:
-        part = parts.pop(0)
-        out[at : at + len(part)] = part
-        at += len(part)
-    return jnp.asarray(out)
+        values[at : at + len(chosen)] = np.asarray(found)[chosen]
+        at += len(chosen)
+    return np.concatenate(kept), from_host(values[: bucket(at)])
 
 
 def _rows(rows, start, count):

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from .._core import bucket
+from .._core import bucket, from_host, host_zeros
 from ..fields import NarrowBand
 from ..shapes import TriangleMesh
 from ._bits import popcount
@@ -26,27 +26,30 @@ def extract_band(band: NarrowBand, method, token) -> Extraction:
     largest = [max((s[k] for s in sums), default=0) for k in range(3)]
     capacity = Capacity(*(bucket(n) for n in largest))
     total = np.sum(sums, axis=0, dtype=np.int64) if sums else np.zeros(3, np.int64)
-    vertices = np.empty((total[0], 3), band.values.dtype)
-    normals = np.empty_like(vertices) if method.normals else None
-    faces = np.empty((total[1], 3), np.int32)
-    v = f = 0
+    shape, held = (total[0], 3), band.values.dtype
+    arrays = [host_zeros(shape, held), host_zeros((total[1], 3), np.int32)]
+    if method.normals:
+        arrays.append(host_zeros(shape, held))
+    ends = [0, 0, 0]
     for start, (count, _, _) in zip(starts, sums, strict=True):
         part = _part(method, band, bits, beside, jnp.int32(start), capacity, token)
-        (points, directed), found = part
-        vertices[v : v + count] = np.asarray(points)[:count]
-        if method.normals:
-            normals[v : v + count] = np.asarray(directed)[:count]
-        num = int(found.num_faces)
-        faces[f : f + num] = np.asarray(found.corners)[:num]
-        v, f = v + count, f + num
+        for k, found in enumerate(_without_padding(*part, count)):
+            arrays[k][ends[k] : ends[k] + len(found)] = found
+            ends[k] += len(found)
     needed = bits.needed
     result = band_status(band, bits, Capacity(*(max(int(n), 1) for n in total)))
-    mesh = TriangleMesh(
-        jnp.asarray(vertices),
-        jnp.asarray(faces[:f]),
-        None if normals is None else jnp.asarray(normals),
-    )
+    filled = [a[:end] for a, end in zip(arrays, ends, strict=False)]
+    mesh = TriangleMesh(*map(from_host, filled))
     return Extraction(mesh, result, needed.vertices, needed.faces, needed.cells)
+
+
+def _without_padding(placed, faces, count):
+    """The vertices, the faces and, if there are any, the normals of a part."""
+    points, directed = placed
+    yield np.asarray(points)[:count]
+    yield np.asarray(faces.corners)[: int(faces.num_faces)]
+    if directed is not None:
+        yield np.asarray(directed)[:count]
 
 
 @eqx.filter_jit

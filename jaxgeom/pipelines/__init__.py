@@ -1,6 +1,8 @@
 """The doors: whole pipelines, in a host form and a compiled form."""
 
 from ._find_start import find_start as find_start
+from ._fit_field import FittedField as FittedField
+from ._fit_field import fit_field as fit_field
 from ._fuse import Fusion as Fusion
 from ._fuse import fuse as fuse
 from ._iterated import IteratedPoisson as IteratedPoisson

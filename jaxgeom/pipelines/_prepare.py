@@ -42,6 +42,15 @@ def prepare(cloud, *, weights=None, orientation=None) -> Prepared:
     that all coincide or lie on a line, flat clouds without normals, and normals of
     which most are zero.
     """
+    ready = unit_box(cloud, weights=weights)
+    oriented, more = _with_normals(ready.cloud, orientation or LocalPlanes())
+    notes = (*ready.notes, *more)
+    where = (ready.center, ready.scale, ready.dtype)
+    return Prepared(oriented, ready.weights, *where, notes)
+
+
+def unit_box(cloud, *, weights=None) -> Prepared:
+    """As `prepare`, but missing normals stay missing, and unusable ones stay."""
     cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(_points_of(cloud))
     weights = _checked_weights(cloud, weights)
     keep = np.asarray(cloud.mask)
@@ -54,10 +63,8 @@ def prepare(cloud, *, weights=None, orientation=None) -> Prepared:
     notes = _check_extent(points - center, scale, cloud.normals is not None)
     dtype = jax.dtypes.canonicalize_dtype(cloud.points.dtype)
     unit = ((points - center) / scale).astype(dtype)
-    oriented = PointCloud(unit, _cast(cloud.normals, dtype), None, cloud.attributes)
-    oriented, more = _with_normals(oriented, orientation or LocalPlanes())
-    notes = notes + more
-    return Prepared(oriented, weights, center, scale, cloud.points.dtype, tuple(notes))
+    boxed = PointCloud(unit, _cast(cloud.normals, dtype), None, cloud.attributes)
+    return Prepared(boxed, weights, center, scale, cloud.points.dtype, tuple(notes))
 
 
 def _points_of(points):

@@ -15,7 +15,7 @@ FLOORS = [
     {"shapes", "transforms"},
     {"neighbors", "linear"},
     {"fields", "meshes", "parametric", "subdivision", "clouds"},
-    {"isosurface", "reconstruction", "registration", "normals"},
+    {"isosurface", "reconstruction", "registration", "normals", "learning"},
     {"pipelines", "convert"},
     {"io", "render"},
     {"cli"},
