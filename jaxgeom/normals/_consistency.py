@@ -76,8 +76,10 @@ class WindingConsistency(AbstractOrientation):
         side = jnp.max(high - low)
         unit = (points - (low + high) / 2) / jnp.where(side > 0, side, 1) + 0.5
         unit = jnp.where(cloud.mask[:, None], unit, 0.5)
-        # Else the compiler would transform the kernel itself, very slowly.
-        width = jax.lax.optimization_barrier(jnp.asarray(self.width, points.dtype))
+        # For coincident points any width serves; one that only the data decides keeps
+        # the compiler from transforming the kernel itself, which takes it minutes.
+        width = jnp.asarray(self.width, points.dtype)
+        width = jnp.where(side > 0, width, 2 * width)
         dipoles = jnp.zeros_like(points)
         for level in reversed(range(self.levels + 1)):
             size = self.resolution // 2**level
