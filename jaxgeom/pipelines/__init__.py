@@ -5,6 +5,7 @@ from ._fit_field import FittedField as FittedField
 from ._fit_field import fit_field as fit_field
 from ._fuse import Fusion as Fusion
 from ._fuse import fuse as fuse
+from ._iterated import IteratedPoisson as IteratedPoisson
 from ._memory import memory_needed as memory_needed
 from ._prepare import prepare as prepare
 from ._pyramid import Pyramid as Pyramid

@@ -6,12 +6,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._core import GeometryError, bucket, message
-from ..normals import estimate, orient_consistently
+from ..normals import LocalPlanes
 from ..shapes import PointCloud, stack
 
 _FEWEST = 4
 _FLAT = 1e-6
-_NEIGHBORS = 16
 
 
 class Prepared(eqx.Module):
@@ -29,21 +28,22 @@ class Prepared(eqx.Module):
     notes: tuple[str, ...] = eqx.field(static=True)
 
 
-def prepare(cloud, *, weights=None) -> Prepared:
+def prepare(cloud, *, weights=None, orientation=None) -> Prepared:
     """The user's points checked, centered in double precision, and oriented.
 
     **Arguments:**
 
-    - `cloud`: a `PointCloud` or an array of points [n, 3]. Missing normals are
-      estimated from 16 neighbors and oriented so that they point outward.
+    - `cloud`: a `PointCloud` or an array of points [n, 3].
     - `weights`: [n] nonnegative confidence, or None.
+    - `orientation`: how missing normals are found, `normals.LocalPlanes()` (planes of
+      16 neighbors) by default, or `normals.WindingConsistency()`.
 
     Raises `GeometryError` for fewer than 4 points, points that are not finite, points
     that all coincide or lie on a line, flat clouds without normals, and normals of
     which most are zero.
     """
     ready = unit_box(cloud, weights=weights)
-    oriented, more = _with_normals(ready.cloud)
+    oriented, more = _with_normals(ready.cloud, orientation or LocalPlanes())
     notes = (*ready.notes, *more)
     where = (ready.center, ready.scale, ready.dtype)
     return Prepared(oriented, ready.weights, *where, notes)
@@ -154,12 +154,12 @@ def _check_extent(centered, scale, has_normals):
     return ["all points lie in one plane: the surface is a thin sheet; use trim"]
 
 
-def _with_normals(cloud):
+def _with_normals(cloud, orientation):
     if cloud.normals is None:
         padded = jax.tree.map(
             lambda x: x[0], stack([cloud], capacity=bucket(cloud.points.shape[0]))
         )
-        oriented = _estimate(padded)
+        oriented = _orient(orientation, padded)
         return PointCloud(
             cloud.points,
             np.asarray(oriented.normals)[: len(cloud.points)],
@@ -182,5 +182,5 @@ def _with_normals(cloud):
 
 
 @eqx.filter_jit
-def _estimate(cloud):
-    return orient_consistently(estimate(cloud, k=_NEIGHBORS))
+def _orient(orientation, cloud):
+    return orientation(cloud)

@@ -63,6 +63,7 @@ def reconstruct(
     method=None,
     extractor=None,
     weights: Float[Array, " n"] | None = None,
+    orientation=None,
     padding: float = 0.1,
     trim: float | None = None,
     min_component: float = 0.01,
@@ -81,6 +82,8 @@ def reconstruct(
     - `extractor`: by default `MarchingCubes` with cubic placement and the asymptotic
       decider.
     - `weights`: [n] confidence of the points.
+    - `orientation`: how missing normals are found: `normals.LocalPlanes()` by default,
+      or `normals.WindingConsistency()`.
     - `padding`: width of the empty margin, as a share of the longest side.
     - `trim`: remove the surface where samples are sparser than `trim` times the median
       density of the samples; the mesh is open there. None keeps it closed.
@@ -93,7 +96,7 @@ def reconstruct(
     check_memory(_checked(resolution), jnp.zeros(()).dtype.itemsize)
     method = ScreenedPoisson() if method is None else method
     extractor = _EXTRACTOR if extractor is None else extractor
-    ready = prepare(cloud, weights=weights)
+    ready = prepare(cloud, weights=weights, orientation=orientation)
     unit, confidence, token = *_padded(ready), runtime_token()
     field = _solve(unit, confidence, method, resolution, padding, token)
     closed = trim is None

@@ -9,6 +9,8 @@ import jaxgeom as jg
 from jaxgeom.io import load_mesh
 from jaxgeom.isosurface import Capacity
 from jaxgeom.meshes import point_to_mesh, sample_surface, volume
+from jaxgeom.normals import WindingConsistency
+from jaxgeom.pipelines import IteratedPoisson
 from jaxgeom.reconstruction import ScreenedPoisson
 
 CAPACITY = Capacity(6000, 12000, 6000)
@@ -49,9 +51,17 @@ def test_units_and_places_do_not_matter(scale, shift):
 
 
 @pytest.mark.slow
-def test_points_alone_are_enough():
+@pytest.mark.parametrize(
+    "orientation",
+    [
+        None,
+        WindingConsistency(resolution=32, levels=1, steps=6),
+        IteratedPoisson(WindingConsistency(resolution=16, levels=0), resolution=32),
+    ],
+)
+def test_points_alone_are_enough(orientation):
     points, _ = _bumpy(3000)
-    out = jg.reconstruct(points, resolution=32)
+    out = jg.reconstruct(points, resolution=32, orientation=orientation)
     assert _closed(out) and float(volume(out.mesh)) > 0
     assert any("estimated" in note for note in out.notes)
 
