@@ -10,10 +10,10 @@ import sys
 
 from .. import __version__
 
-OK, INTERNAL, USAGE, FILE, DATA, CHECK, INTERRUPTED = 0, 1, 2, 3, 4, 5, 130
+OK, INTERNAL, USAGE, FILE, DATA, CHECK, SOME, INTERRUPTED = 0, 1, 2, 3, 4, 5, 6, 130
 
 _EPILOG = """exit codes: 0 ok, 1 internal error, 2 usage, 3 file, 4 bad data,
-5 the result failed its own check, 130 interrupted"""
+5 the result failed its own check, 6 some scans of a batch failed, 130 interrupted"""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -72,6 +72,7 @@ def _parser():
     _add_reconstruct(commands)
     _add_register(commands)
     _add_register_many(commands)
+    _add_batch(commands)
     _add_fuse(commands)
     _add_mesh(commands)
     _add_info(commands)
@@ -169,8 +170,31 @@ def _add_register_many(commands):
     _add_alignment(command)
 
 
+def _add_batch(commands):
+    command = commands.add_parser(
+        "batch", help="register every line of a manifest; a rerun goes on"
+    )
+    command.add_argument(
+        "manifest", metavar="MANIFEST", help="CSV or JSONL: id, source, target, init"
+    )
+    command.add_argument("--out", required=True, metavar="DIR", help="folder of states")
+    command.add_argument(
+        "--shard", metavar="I/N", help="from 0/N (default: of the array job, or all)"
+    )
+    command.add_argument("--retry-failed", action="store_true")
+    command.add_argument(
+        "--chunk", type=_chunk, default=64, metavar="B", help="scans in one call (64)"
+    )
+    _add_alignment(command)
+    status = commands.add_parser("batch-status", help="how the scans of a batch ended")
+    status.add_argument("out", metavar="DIR")
+    table = commands.add_parser("batch-collect", help="one CSV table of a batch")
+    table.add_argument("out", metavar="DIR")
+    table.add_argument("-o", "--output", required=True, metavar="CSV")
+
+
 def _add_alignment(command):
-    """The options of both commands that align scans."""
+    """The options of every command that aligns scans."""
     command.add_argument(
         "--objective",
         choices=("point-to-point", "point-to-plane", "symmetric", "generalized"),
@@ -319,6 +343,7 @@ def _number(kind, low, high, what):
     return parse
 
 
+_chunk = _number(int, 1, 4096, "a whole number from 1 to 4096")
 _resolution = _number(int, 8, 4096, "a whole number from 8 to 4096")
 _mesh_resolution = _number(int, 8, 1024, "a whole number from 8 to 1024")
 _finite = _number(float, -1e12, 1e12, "a number")

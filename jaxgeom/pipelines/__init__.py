@@ -11,6 +11,7 @@ from ._prepare import prepare as prepare
 from ._pyramid import Pyramid as Pyramid
 from ._pyramid import choose_voxel_size as choose_voxel_size
 from ._pyramid import level_rooms as level_rooms
+from ._pyramid import without_sparse_levels as without_sparse_levels
 from ._reconstruct import Reconstruction as Reconstruction
 from ._reconstruct import reconstruct as reconstruct
 from ._reconstruct import reconstruct_jit as reconstruct_jit

@@ -4,6 +4,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float
 
 from .._core import RESULTS, GeometryError, bucket, message
@@ -107,6 +109,7 @@ def register_many(
     voxel_size: float | None = None,
     init: Rigid | Similarity | Affine | None = None,
     pyramid: Pyramid | None = None,
+    rooms: tuple[int | None, ...] | None = None,
     chunk: int = 1,
 ) -> Registration:
     """The alignments of a batch of scans, in one compiled call; fields are batched.
@@ -116,11 +119,14 @@ def register_many(
     - `sources`: ragged scans as one batch [b, n, 3] with masks, of `stack`.
     - `target`: one cloud for all, or a batch [b, m, 3] with one for each.
     - `init`: batched transforms; identity by default.
-    - `chunk`: how many are aligned at once; memory grows with it. One at a time is
-      fastest on a CPU.
+    - `rooms`: the capacity of every level, such as of `level_rooms`, so that batches
+      of one size share one program; by default what this batch needs, without levels
+      on which its scans are sparse.
+    - `chunk`: how many each device aligns at once; memory grows with it. One at a
+      time is fastest on a CPU.
 
-    Every item has its own status; none is ever raised. Raises `GeometryError` where the
-    shapes do not go together.
+    The batch is divided among all local devices. Every item has its own status; none
+    is ever raised. Raises `GeometryError` where the shapes do not go together.
     """
     pyramid = Pyramid() if pyramid is None else pyramid
     _check_batches(sources, target)
@@ -132,18 +138,18 @@ def register_many(
     some = [points for points in rows if len(points)]
     if voxel_size is None:
         voxel_size = float(np.median([choose_voxel_size(p) for p in some] or [1.0]))
-    some = some or [np.zeros((1, 3))]
-    pyramid = without_sparse_levels(some, voxel_size, pyramid)
-    rooms = level_rooms(some, voxel_size, pyramid)
+    if rooms is None:
+        some = some or [np.zeros((1, 3))]
+        pyramid = without_sparse_levels(some, voxel_size, pyramid)
+        rooms = level_rooms(some, voxel_size, pyramid)
     center = np.stack([_mean(points) for points in rows[b:]])
     start = _identities(b) if init is None else _as(init, np.float64)
     start = _conjugated(start, center)
     sources, targets = _same_size(batches, center)
     dtype = sources.points.dtype
-    found = _run_many(
-        *(sources, targets, jnp.asarray(voxel_size, dtype), _as(start, dtype)),
-        *(rooms, pyramid, chunk),
-    )
+    items = (sources, targets, _as(start, dtype))
+    size = jnp.asarray(voxel_size, dtype)
+    found = _run_divided(items, size, rooms, pyramid, chunk)
     moved = _conjugated(_as(found.target_from_source, np.float64), -center)
     return eqx.tree_at(lambda r: r.target_from_source, found, moved)
 
@@ -165,10 +171,30 @@ def _check_batches(sources, target):
     )
 
 
+def _run_divided(items, voxel_size, rooms, pyramid, chunk):
+    """All items, divided among the local devices; uneven batches repeat the last."""
+    b, num_devices = len(items[0].points), jax.local_device_count()
+    if num_devices == 1 or b == 1:
+        return _run_many(*(items, voxel_size, rooms, pyramid, chunk), None)
+    rows = np.minimum(np.arange(-(-b // num_devices) * num_devices), b - 1)
+    mesh = Mesh(np.asarray(jax.local_devices()), ("scan",))
+    place = lambda x: jax.device_put(
+        np.asarray(x)[rows], NamedSharding(mesh, P("scan"))
+    )
+    items = jax.tree.map(place, items)
+    found = _run_many(items, voxel_size, rooms, pyramid, chunk, mesh)
+    return jax.tree.map(lambda x: np.asarray(x)[:b], found)
+
+
 @eqx.filter_jit
-def _run_many(sources, targets, voxel_size, starts, rooms, pyramid, chunk):
+def _run_many(items, voxel_size, rooms, pyramid, chunk, mesh):
     one = lambda item: align(*item[:2], voxel_size, item[2], rooms, pyramid)
-    return jax.lax.map(one, (sources, targets, starts), batch_size=chunk)
+    run = lambda items: jax.lax.map(one, items, batch_size=chunk)
+    if mesh is None:
+        return run(items)
+    # Each device loops over its own scans: a loop over a divided axis would not.
+    spread = {"in_specs": P("scan"), "out_specs": P("scan"), "check_vma": False}
+    return jax.shard_map(run, mesh=mesh, **spread)(items)
 
 
 def _checked(cloud, name) -> PointCloud:

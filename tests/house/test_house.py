@@ -18,6 +18,7 @@ FLOORS = [
     {"isosurface", "reconstruction", "registration", "normals", "learning"},
     {"pipelines", "convert"},
     {"io", "render"},
+    {"batch"},
     {"cli"},
 ]
 # Nouns know only nouns: a transform moves clouds and meshes, so shapes lie below it.

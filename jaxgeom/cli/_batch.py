@@ -1,0 +1,35 @@
+"""`jaxgeom batch MANIFEST --out DIR`."""
+
+import os
+import sys
+
+from ..batch import run_batch, shard_of, shard_of_environment
+from ._alignment import settings
+from ._main import OK, SOME
+from ._report import write_report
+
+_CHOICES = (
+    *("objective", "kernel", "max_correspondence_distance", "voxel_size"),
+    "with_scale",
+)
+
+
+def run(arguments) -> int:
+    """Register the scans of the shard that are not finished."""
+    given = arguments.shard
+    shard = shard_of(given) if given else shard_of_environment(os.environ)
+    choices = {name: getattr(arguments, name) for name in _CHOICES}
+    tally = run_batch(
+        arguments.manifest,
+        arguments.out,
+        settings=lambda target: settings(arguments, target),
+        choices=choices,
+        shard=shard,
+        retry_failed=arguments.retry_failed,
+        chunk=arguments.chunk,
+        tell=lambda text: print(f"jaxgeom: {text}", file=sys.stderr, flush=True),
+    )
+    print(", ".join(f"{number} {name}" for name, number in tally.items()))
+    if arguments.report:
+        write_report(arguments.report, parameters=vars(arguments), result=tally)
+    return SOME if tally["failed"] else OK
