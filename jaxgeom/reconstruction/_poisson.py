@@ -134,7 +134,7 @@ def _solve(cloud, grid, method, screening, weights, token) -> FieldSolution:
     shape, levels = grid.shape, method.levels
     if levels is None:
         levels = levels_for(cloud.points.shape[0], shape)
-    samples = _samples(cloud, grid)
+    samples = prepared_samples(cloud, grid)
     unit = jnp.prod(grid.spacing) ** (1 / 3)
     found = sample_geometry(
         samples.q, samples.normals, samples.real, shape, levels=levels, token=token
@@ -173,7 +173,7 @@ def _minimiser(side, q, pull, coefficients, method, token) -> LinearSolution:
     return minimise(side, q, pull, coefficients, fixed, **settings)
 
 
-def _samples(cloud, grid) -> _Samples:
+def prepared_samples(cloud, grid) -> _Samples:
     """Drop what cannot be used, and say so."""
     cloud = cloud.washed()
     finite = jnp.isfinite(cloud.points).all(-1) & jnp.isfinite(cloud.normals).all(-1)

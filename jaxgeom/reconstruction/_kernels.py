@@ -1,0 +1,121 @@
+"""Stationary covariances by their spectra on a periodic grid."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..shapes import Grid
+
+
+class AbstractKernel(eqx.Module):
+    """A covariance k(x - x') that depends on the distance only."""
+
+    @abstractmethod
+    def spectrum(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Its Fourier transform, up to a factor, at squared angular frequencies."""
+
+
+class SquaredExponential(AbstractKernel):
+    """k(r) = exp(-r^2 / (2 length^2)), of spectrum exp(-length^2 |k|^2 / 2).
+
+    `length`: in the unit of the points.
+    """
+
+    length: Float[Array, ""] | float
+
+    def spectrum(self, square):
+        return jnp.exp(-square * self.length**2 / 2)
+
+
+class Matern(AbstractKernel):
+    """The covariance of Matern with smoothness nu, of spectrum
+    (2 nu / length^2 + |k|^2)^-(nu + 3/2).
+
+    `length`: in the unit of the points; `smoothness`: nu, 3/2 for fields with one
+    derivative. Rasmussen and Williams (2006), "Gaussian processes for machine
+    learning", equation 4.15.
+    """
+
+    length: Float[Array, ""] | float
+    smoothness: float = 1.5
+
+    def spectrum(self, square):
+        nu = self.smoothness
+        # Divided by the constant term, so that a long length does not underflow.
+        return (1 + square * self.length**2 / (2 * nu)) ** -(nu + 1.5)
+
+
+class Spectrum(eqx.Module):
+    """A kernel of variance `variance` on a grid that is one period, by frequencies.
+
+    - `power`: [x, y, z // 2 + 1] rho, with k(x) = sum_k rho(k) exp(i k x).
+    - `ascent`: [3, ...] k_d / |k|^2, zero at k = 0: f = div^-1 of a vector field v has
+      the transform -i sum_d ascent_d v_d.
+    """
+
+    power: Float[Array, "x y m"]
+    ascent: Float[Array, "3 x y m"]
+    shape: tuple[int, int, int] = eqx.field(static=True)
+
+    @staticmethod
+    def of(kernel: AbstractKernel, variance, grid: Grid) -> "Spectrum":
+        """The spectrum on a grid, scaled so that k(0) is the variance."""
+        shape, half = grid.shape, grid.shape[2] // 2 + 1
+        axes = []
+        for d, n in enumerate(shape):
+            k = 2 * jnp.pi * jnp.fft.fftfreq(n).astype(grid.spacing.dtype)
+            axes.append(
+                (k / grid.spacing[d]).reshape([-1 if d == e else 1 for e in range(3)])
+            )
+        square = sum(k**2 for k in axes)
+        power = kernel.spectrum(square)
+        power = variance * power / jnp.sum(power)
+        # The highest frequency of an even grid has no sine: no odd derivative.
+        odd = [
+            jnp.where(2 * jnp.abs(k) * grid.spacing[d] >= 2 * jnp.pi, 0, k)
+            for d, k in enumerate(axes)
+        ]
+        inverse = jnp.where(square > 0, 1 / jnp.where(square > 0, square, 1), 0)
+        ascent = jnp.stack([jnp.broadcast_to(k * inverse, shape) for k in odd])
+        return Spectrum(power[..., :half], ascent[..., :half], shape)
+
+    def smooth(self, x: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
+        """K x: the convolution with the kernel."""
+        return self.back(self._size() * self.power * jnp.fft.rfftn(x))
+
+    def color(self, white: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
+        """A field with this covariance, from one without."""
+        return self.back(jnp.sqrt(self._size() * self.power) * jnp.fft.rfftn(white))
+
+    def potential(self, v: Float[Array, "3 x y z"]) -> Float[Array, "x y z"]:
+        """f with Laplacian f = div v and mean 0."""
+        spectra = jnp.fft.rfftn(v, axes=(1, 2, 3))
+        return self.back(-1j * jnp.sum(self.ascent * spectra, axis=0))
+
+    def field_from(self, sources: Float[Array, "3 x y z"]) -> Float[Array, "x y z"]:
+        """Cov(f, v) sources."""
+        spectra = jnp.fft.rfftn(sources, axes=(1, 2, 3))
+        return self.back(
+            -1j * self._size() * self.power * jnp.sum(self.ascent * spectra, 0)
+        )
+
+    def vectors_from(self, source: Float[Array, "x y z"]) -> Float[Array, "3 x y z"]:
+        """Cov(v, f) source, the transpose of `field_from`."""
+        spectrum = self._size() * self.power * jnp.fft.rfftn(source)
+        return jnp.stack([self.back(1j * a * spectrum) for a in self.ascent])
+
+    def variance_of(self, source: Float[Array, "x y z"]) -> Float[Array, ""]:
+        """source^T Cov(f, f) source."""
+        power = self.power * jnp.sum(self.ascent**2, axis=0)
+        spectrum = self._size() * power * jnp.fft.rfftn(source)
+        return jnp.vdot(source, self.back(spectrum))
+
+    def back(self, spectrum):
+        """The values of a transform."""
+        return jnp.fft.irfftn(spectrum, s=self.shape)
+
+    def _size(self):
+        x, y, z = self.shape
+        return x * y * z

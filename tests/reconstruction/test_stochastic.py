@@ -1,0 +1,251 @@
+"""The posterior over fields against closed forms, dense algebra and real scans."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxgeom import RESULTS
+from jaxgeom._core import GeometryError
+from jaxgeom.reconstruction import (
+    Matern,
+    SquaredExponential,
+    StochasticPoisson,
+    probability_hit,
+    stochastic_poisson,
+    view_score,
+)
+from jaxgeom.shapes import Grid, PointCloud
+
+SHAPE = (8, 7, 9)
+SETTINGS = dict(noise=0.2, variance=0.4, rtol=1e-10, max_steps=200)
+
+
+def small(seed=0, n=6, dtype=np.float64):
+    """A few samples in the middle of a box that is no cube, and queries."""
+    rng = np.random.default_rng(seed)
+    spacing = np.array([0.5, 0.6, 0.45])
+    grid = Grid(np.array([-1.0, 0.3, 2.0], dtype), spacing.astype(dtype), SHAPE)
+    inner = grid.origin + spacing * (1 + rng.random((n + 3, 3)) * (np.array(SHAPE) - 3))
+    normals = rng.standard_normal((n, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    cloud = PointCloud(jnp.asarray(inner[:n], dtype), jnp.asarray(normals, dtype))
+    return cloud, grid, jnp.asarray(inner[n:], dtype)
+
+
+def dense_rows(grid, points):
+    """W as a matrix."""
+    out = np.zeros((len(points), *grid.shape))
+    q = (np.asarray(points) - grid.origin) / grid.spacing
+    base = np.floor(q).astype(int)
+    for corner in range(8):
+        step = np.array([corner & 1, corner >> 1 & 1, corner >> 2])
+        share = np.prod(np.where(step, q - base, 1 - (q - base)), axis=1)
+        for row, at, s in zip(out, base + step, share, strict=True):
+            row[tuple(at)] += s
+    return out.reshape(len(points), -1)
+
+
+def dense_posterior(cloud, grid, points, kernel, noise, variance):
+    """Mean and covariance of the anchored field at points, by sums over frequencies."""
+    size = [n * h for n, h in zip(grid.shape, grid.spacing, strict=True)]
+    whole = [np.fft.fftfreq(n, 1 / n) for n in grid.shape]
+    k = np.stack(np.meshgrid(*whole, indexing="ij"), -1).reshape(-1, 3)
+    nyquist = 2 * np.abs(k) == np.array(grid.shape)
+    k = 2 * np.pi * k / size
+    rho = np.asarray(kernel.spectrum(np.sum(k**2, axis=1)))
+    rho = variance * rho / rho.sum()
+    nodes = np.asarray(grid.nodes()).reshape(-1, 3)
+    waves = np.exp(1j * nodes @ k.T)
+    square = np.where(np.arange(len(k)) > 0, np.sum(k**2, axis=1), np.inf)
+    odd = np.where(nyquist, 0, k)
+    cov = lambda w: (waves * w @ waves.conj().T).real
+    at, to = dense_rows(grid, cloud.points), dense_rows(grid, points)
+    to = to - at.mean(0)
+    inverse = np.linalg.inv(at @ cov(rho) @ at.T + noise**2 * np.eye(len(at)))
+    mean, known = 0, 0
+    for d in range(3):
+        cross = to @ cov(-1j * odd[:, d] / square * rho) @ at.T
+        mean = mean + cross @ inverse @ np.asarray(cloud.normals)[:, d]
+        known = known + cross @ inverse @ cross.T
+    prior = to @ cov(rho * np.sum(odd**2, axis=1) / square**2) @ to.T
+    return mean, prior - known
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [Matern(1.1), pytest.param(SquaredExponential(0.8), marks=pytest.mark.slow)],
+)
+def test_mean_and_deviation_are_those_of_dense_algebra(x64, kernel):
+    cloud, grid, points = small()
+    found = _run(cloud, grid, kernel)
+    expected, cov = dense_posterior(cloud, grid, points, kernel, 0.2, 0.4)
+    assert found.result == RESULTS.successful
+    np.testing.assert_allclose(jax.vmap(found)(points), expected, rtol=1e-7, atol=1e-9)
+    std = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose(_std(found, points), std, rtol=1e-6)
+    inside = found.probability_inside(points)
+    z = expected / std
+    normal = jax.scipy.stats.norm
+    np.testing.assert_allclose(inside, normal.cdf(-z), rtol=1e-5)
+    np.testing.assert_allclose(
+        found.surface_density(points), normal.pdf(z) / std, rtol=1e-5
+    )
+
+
+@jax.jit
+def _std(posterior, points):
+    return posterior.std(points)
+
+
+@jax.jit
+def _run(cloud, grid, kernel):
+    return stochastic_poisson(cloud, grid, kernel=kernel, **SETTINGS)
+
+
+@pytest.mark.slow
+def test_samples_have_the_mean_and_the_covariance(x64):
+    cloud, grid, points = small()
+    found = _run(cloud, grid, Matern(1.1))
+    draw = jax.jit(lambda p, key: p.samples(key, 4000))
+    fields = draw(found, jax.random.key(1))
+    to = dense_rows(grid, points)
+    values = np.asarray(fields).reshape(4000, -1) @ to.T
+    mean, cov = dense_posterior(cloud, grid, points, Matern(1.1), 0.2, 0.4)
+    # Five standard errors of 4000 draws.
+    std = np.sqrt(np.diag(cov))
+    assert np.all(np.abs(values.mean(0) - mean) < 5 * std / np.sqrt(4000))
+    product = np.sqrt(np.outer(std**2, std**2) + cov**2)
+    assert np.all(np.abs(np.cov(values.T) - cov) < 5 * product / np.sqrt(4000))
+    hit = probability_hit(fields, grid, points[None])
+    np.testing.assert_allclose(hit[0], (values < 0).any(1).mean(), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_closed_forms_on_the_torus(x64):
+    """The covariances of the continuous model, of period 2 pi, without a grid."""
+    n, length = 48, 0.7
+    h = 2 * np.pi / n
+    grid = Grid(jnp.zeros(3), jnp.full(3, h), (n,) * 3)
+    rng = np.random.default_rng(3)
+    points, normals = 1.5 + 3 * rng.random((12, 3)), rng.standard_normal((12, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    queries = 1.2 + 3.5 * rng.random((20, 3))
+    whole = np.arange(-12, 13)
+    k = np.stack(np.meshgrid(whole, whole, whole, indexing="ij"), -1).reshape(-1, 3)
+    square = np.sum(k**2, axis=1).astype(float)
+    rho = np.exp(-square * length**2 / 2)
+    rho *= 0.4 / rho.sum()
+    square[square == 0] = np.inf
+    pair = lambda a, b, w, f: f((a[:, None] - b[None]) @ k.T) @ w
+    gram = pair(points, points, rho, np.cos) + 0.2**2 * np.eye(12)
+    inverse = np.linalg.inv(gram)
+    mean, known = 0, 0
+    for d in range(3):
+        weight = k[:, d] * rho / square
+        anchor = pair(points, points, weight, np.sin).mean(0)
+        cross = pair(queries, points, weight, np.sin) - anchor
+        mean = mean + cross @ inverse @ normals[:, d]
+        known = known + np.sum(cross @ inverse * cross, axis=1)
+    own = functools.partial(pair, w=rho / square, f=np.cos)
+    prior = own(queries[:1], queries[:1])[0, 0] - 2 * own(queries, points).mean(1)
+    std = np.sqrt(prior + own(points, points).mean() - known)
+    cloud = PointCloud(jnp.asarray(points), jnp.asarray(normals))
+    found = _run(cloud, grid, SquaredExponential(length))
+    error = np.abs(jax.vmap(found)(jnp.asarray(queries)) - mean)
+    assert error.max() < 0.01 * np.abs(mean).max()
+    np.testing.assert_allclose(_std(found, jnp.asarray(queries)), std, rtol=0.02)
+
+
+def test_padding_has_no_influence(x64):
+    cloud, grid, points = small()
+    bad = jnp.full((2, 3), jnp.nan)
+    padded = PointCloud(
+        jnp.concatenate([cloud.points, bad]),
+        jnp.concatenate([cloud.normals, bad]),
+        jnp.arange(8) < 6,
+    )
+    kernel = Matern(1.1)
+    one, other = _run(cloud, grid, kernel), _run(padded, grid, kernel)
+    assert other.result == RESULTS.successful
+    np.testing.assert_allclose(other.values, one.values, atol=1e-12)
+    np.testing.assert_allclose(_std(other, points), _std(one, points), rtol=1e-9)
+    draw = jax.jit(lambda p, key: p.samples(key, 2))
+    assert np.isfinite(draw(other, jax.random.key(0))).all()
+
+    def loss(normals):
+        c = PointCloud(padded.points, normals, padded.mask)
+        return jnp.sum(_run(c, grid, kernel).values ** 2)
+
+    slope = jax.grad(loss)(padded.normals.at[6:].set(0.3))
+    assert np.all(np.asarray(slope[6:]) == 0) and np.any(np.asarray(slope[:6]) != 0)
+
+
+@pytest.mark.slow
+def test_vmap_is_the_loop(x64):
+    clouds = [small(seed)[0] for seed in range(3)]
+    grid, points = small()[1:]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *clouds)
+
+    def one(cloud):
+        found = stochastic_poisson(cloud, grid, kernel=Matern(1.1), **SETTINGS)
+        return found.values, found.std(points), found.steps
+
+    many = jax.jit(jax.vmap(one))(stacked)
+    alone = [jax.jit(one)(c) for c in clouds]
+    for got, expected in zip(many, zip(*alone, strict=True), strict=True):
+        np.testing.assert_allclose(got, np.stack(expected), rtol=1e-6, atol=1e-8)
+
+
+def test_derivatives_are_central_differences(x64):
+    cloud, grid, points = small()
+
+    @jax.jit
+    def scalar(moved, length, noise, at):
+        c = PointCloud(moved, cloud.normals)
+        settings = {**SETTINGS, "noise": noise}
+        found = stochastic_poisson(c, grid, kernel=Matern(length), **settings)
+        return jnp.sum(found.std(at)) + jnp.sum(jax.vmap(found)(at) ** 2)
+
+    at = (cloud.points, jnp.float64(1.1), jnp.float64(0.2), points)
+    slopes = jax.jit(jax.grad(scalar, argnums=(0, 1, 2, 3)))(*at)
+    rng = np.random.default_rng(5)
+    for i, x in enumerate(at):
+        along, h = rng.standard_normal(np.shape(x)), 1e-5
+        moved = lambda s, i=i, a=along, x=x: scalar(*at[:i], x + s * a, *at[i + 1 :])
+        expected = (moved(h) - moved(-h)) / (2 * h)
+        np.testing.assert_allclose(np.sum(slopes[i] * along), expected, rtol=2e-5)
+
+
+def test_a_view_of_what_is_unknown_scores_high_and_has_a_slope(x64):
+    cloud, grid, _ = small()
+    fields = jnp.ones((3, *SHAPE)) * jnp.array([0.9, 1.0, 1.1])[:, None, None, None]
+    unsure = fields.at[:, 3:5, 2:5].set(
+        jnp.array([-1.0, 0.0, 1.1])[:, None, None, None]
+    )
+    start = jnp.asarray(grid.origin)[None] + jnp.array([[0.1, 1.8, 1.7]])
+    along = jnp.array([[1.0, 0.0, 0.0]])
+    score = lambda v, x: view_score(v, grid, x, along, length=3.5, num_steps=50)
+    assert score(fields, start) < 1e-6 < 0.05 < score(unsure, start)
+    slope = jax.grad(score, argnums=1)(unsure, start)
+    h = 1e-6
+    moved = lambda s: score(unsure, start + s * jnp.array([[0.0, 1.0, 0.0]]))
+    np.testing.assert_allclose(slope[0, 1], (moved(h) - moved(-h)) / (2 * h), rtol=1e-4)
+
+
+def test_statuses_and_errors(x64):
+    cloud, grid, _ = small()
+    few = PointCloud(cloud.points[:2], cloud.normals[:2])
+    run = lambda c, **s: stochastic_poisson(c, grid, kernel=Matern(1.1), **s).result
+    assert run(few) == RESULTS.too_few_points
+    assert run(cloud, rtol=1e-12, max_steps=1) == RESULTS.not_converged
+    assert run(cloud, weights=jnp.ones(6)) == RESULTS.successful
+    with pytest.raises(GeometryError, match="with normals"):
+        StochasticPoisson()(PointCloud(cloud.points), grid)
+    out = stochastic_poisson(cloud, grid, weights=jnp.arange(6) > 0.0)
+    rest = PointCloud(cloud.points[1:], cloud.normals[1:])
+    np.testing.assert_allclose(
+        out.values, stochastic_poisson(rest, grid).values, atol=1e-3
+    )
