@@ -84,13 +84,16 @@ class _State(eqx.Module):
 _OPENING, _ITERATING, _CLOSING, _DONE = range(4)
 
 
-def iterate(matvec, b, *, rtol, max_steps, preconditioner, start) -> LinearSolution:
+def iterate(
+    matvec, b, *, rtol, max_steps, preconditioner, start, dot=jnp.vdot
+) -> LinearSolution:
     """`conjugate_gradients` without derivative, for use inside other solvers.
 
     Every pass of the loop applies the operator once, to the iterate or to a direction,
-    so that a large operator is compiled once.
+    so that a large operator is compiled once. `dot` is the inner product: that of grids
+    in parts sums over the parts.
     """
-    goal = jnp.asarray(rtol, b.dtype) ** 2 * jnp.vdot(b, b)
+    goal = jnp.asarray(rtol, b.dtype) ** 2 * dot(b, b)
     x = start(b)
     # Whatever p is, an infinite rz makes the first direction z itself.
     big, none = jnp.full((), jnp.inf, b.dtype), jnp.int32(0)
@@ -98,7 +101,7 @@ def iterate(matvec, b, *, rtol, max_steps, preconditioner, start) -> LinearSolut
 
     def direction(state):
         z = preconditioner(state.r)
-        rz = jnp.vdot(state.r, z)
+        rz = dot(state.r, z)
         return z + safe_divide(rz, state.rz) * state.p, rz
 
     def step(state):
@@ -107,9 +110,9 @@ def iterate(matvec, b, *, rtol, max_steps, preconditioner, start) -> LinearSolut
         p, rz = lax.cond(exact, at_iterate, direction, state)
         q = matvec(p)
         # A vanishing curvature means that the residual is rounding error already.
-        length = jnp.where(exact, 0, safe_divide(rz, jnp.vdot(p, q)))
+        length = jnp.where(exact, 0, safe_divide(rz, dot(p, q)))
         r = jnp.where(exact, b, state.r) - jnp.where(exact, 1, length) * q
-        square, steps = jnp.vdot(r, r), state.steps + ~exact
+        square, steps = dot(r, r), state.steps + ~exact
         more = (square > goal) & (steps < max_steps)
         ended = jnp.where(exact & (steps == 0), _DONE, _CLOSING)
         phase = jnp.where(more, _ITERATING, ended)
@@ -117,7 +120,7 @@ def iterate(matvec, b, *, rtol, max_steps, preconditioner, start) -> LinearSolut
         return _State(state.x + length * p, r, p, rz, square, steps, phase)
 
     end = lax.while_loop(lambda s: s.phase != _DONE, step, first)
-    residual = jnp.sqrt(safe_divide(end.square, jnp.vdot(b, b)))
+    residual = jnp.sqrt(safe_divide(end.square, dot(b, b)))
     converged = residual <= rtol
     result = RESULTS.where(converged, RESULTS.successful, RESULTS.not_converged)
     return LinearSolution(end.x, residual, end.steps, result)

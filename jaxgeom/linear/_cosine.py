@@ -20,7 +20,7 @@ class CosineTransform(eqx.Module):
     @staticmethod
     def of(shape, coefficients: Float[Array, " 3"]) -> "CosineTransform":
         """The transform that diagonalises `laplacian(_, coefficients)`."""
-        bases = tuple(_basis(n, coefficients.dtype) for n in shape)
+        bases = tuple(basis(n, coefficients.dtype) for n in shape)
         lines = [
             c * (2 - 2 * jnp.cos(jnp.pi * jnp.arange(n, dtype=c.dtype) / n))
             for n, c in zip(shape, coefficients, strict=True)
@@ -32,9 +32,9 @@ class CosineTransform(eqx.Module):
         """(L + shift)^-1 b; for shift 0 that of zero mean, for b less its mean."""
         divisor = self.eigenvalues + shift
         regular = divisor > 0
-        spectrum = _along_axes(self.bases, b)
+        spectrum = along_axes(self.bases, b)
         scaled = jnp.where(regular, spectrum / jnp.where(regular, divisor, 1.0), 0.0)
-        return _along_axes(tuple(base.T for base in self.bases), scaled)
+        return along_axes(tuple(base.T for base in self.bases), scaled)
 
 
 def cosine_solve(
@@ -44,15 +44,18 @@ def cosine_solve(
     return CosineTransform.of(b.shape, coefficients).solve(b, shift)
 
 
-def _basis(n, dtype):
+def basis(n, dtype):
     """Rows are the orthonormal cosines of n nodes."""
     k = jnp.arange(n, dtype=dtype)[:, None]
     rows = jnp.cos(jnp.pi * k * (jnp.arange(n, dtype=dtype) + 0.5) / n)
     return rows * jnp.where(k == 0, jnp.sqrt(1 / n), jnp.sqrt(2 / n)).astype(dtype)
 
 
-def _along_axes(matrices, u):
+def along_axes(matrices, u):
+    """The matrices applied along the axes; None leaves an axis as it is."""
     for axis, matrix in enumerate(matrices):
+        if matrix is None:
+            continue
         product = jnp.tensordot(
             matrix, u, (1, axis), precision=jax.lax.Precision.HIGHEST
         )

@@ -16,7 +16,7 @@ from .._core import stage
 from ._stencils import laplacian, laplacian_diagonal
 from ._transfer import prolong, restrict
 
-_DAMPING = 0.85
+DAMPING = 0.85
 _COARSEST = 16
 _COARSEST_SWEEPS = 12
 
@@ -73,7 +73,7 @@ class Multigrid(eqx.Module):
         diagonal = laplacian_diagonal(
             self.diagonals[level].shape, 2.0**level * self.coefficients
         )
-        return _DAMPING / (diagonal + self.diagonals[level])
+        return DAMPING / (diagonal + self.diagonals[level])
 
     def _first_sweep(self, r, level):
         u = self._step(level) * r

@@ -33,10 +33,10 @@ def prolong(
     token: Bool[Array, ""] | None = None,
 ) -> Float[Array, "i j k"]:
     """P u on the finer grid of `shape`, added to the values `onto`, if any."""
-    u = stage(token, lambda u: _interleaved(u, shape[2]), u)
+    u = stage(token, lambda u: interleaved(u, shape[2]), u)
     if onto is None:
-        return stage(token, lambda u: _finer(_finer(u, 1, shape[1]), 0, shape[0]), u)
-    added = lambda v, u: v + _finer(_finer(u, 1, shape[1]), 0, shape[0])
+        return stage(token, lambda u: finer(finer(u, 1, shape[1]), 0, shape[0]), u)
+    added = lambda v, u: v + finer(finer(u, 1, shape[1]), 0, shape[0])
     return stage(token, added, onto, u)
 
 
@@ -45,12 +45,12 @@ def restrict(
 ) -> Float[Array, "i j k"]:
     """P^T u on the coarser grid: sums are kept."""
     for axis in range(3):
-        u = stage(token, lambda u, axis=axis: _coarser(u, axis), u)
+        u = stage(token, lambda u, axis=axis: coarser(u, axis), u)
     return u
 
 
 @partial(jax.jit, static_argnames="n")
-def _interleaved(u, n):
+def interleaved(u, n):
     """P along the last axis, where gathers are slow: even and odd nodes apart."""
     last = u.shape[2] - 1
     index = np.arange(last + 1)
@@ -60,7 +60,7 @@ def _interleaved(u, n):
 
 
 @partial(jax.jit, static_argnames=("axis", "n"))
-def _finer(u, axis, n):
+def finer(u, axis, n):
     """P along one axis."""
     fine = np.arange(n)
     near = fine // 2
@@ -69,7 +69,7 @@ def _finer(u, axis, n):
 
 
 @partial(jax.jit, static_argnames="axis")
-def _coarser(u, axis):
+def coarser(u, axis):
     """P^T along one axis."""
     n = u.shape[axis]
     coarse = np.arange(-(-n // 2))
