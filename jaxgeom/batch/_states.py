@@ -7,6 +7,10 @@ import uuid
 import zlib
 
 STATES = ("ok", "warning", "failed")
+_FIELDS = {
+    *("schema", "id", "status", "code", "message", "transform", "fitness", "rmse"),
+    *("seconds", "versions", "input_hash"),
+}
 
 
 def state_path(out, name: str) -> pathlib.Path:
@@ -41,7 +45,8 @@ def read_state(path) -> dict | None:
         state = json.loads(pathlib.Path(path).read_text())
     except (FileNotFoundError, ValueError):
         return None
-    whole = isinstance(state, dict) and state.get("status") in STATES
+    whole = isinstance(state, dict) and set(state) >= _FIELDS
+    whole = whole and state["status"] in STATES
     return state if whole else None
 
 

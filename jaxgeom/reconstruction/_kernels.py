@@ -4,6 +4,7 @@ from abc import abstractmethod
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..shapes import Grid
@@ -56,6 +57,7 @@ class Spectrum(eqx.Module):
     """
 
     power: Float[Array, "x y m"]
+    variance: Float[Array, ""]
     ascent: Float[Array, "3 x y m"]
     shape: tuple[int, int, int] = eqx.field(static=True)
 
@@ -63,23 +65,22 @@ class Spectrum(eqx.Module):
     def of(kernel: AbstractKernel, variance, grid: Grid) -> "Spectrum":
         """The spectrum on a grid, scaled so that k(0) is the variance."""
         shape, half = grid.shape, grid.shape[2] // 2 + 1
-        axes = []
+        axes, odd = [], []
         for d, n in enumerate(shape):
-            k = 2 * jnp.pi * jnp.fft.fftfreq(n).astype(grid.spacing.dtype)
-            axes.append(
-                (k / grid.spacing[d]).reshape([-1 if d == e else 1 for e in range(3)])
-            )
+            number = np.fft.fftfreq(n, 1 / n)
+            line = [-1 if d == e else 1 for e in range(3)]
+            k = 2 * np.pi * jnp.asarray(number, grid.spacing.dtype)
+            axes.append((k / (n * grid.spacing[d])).reshape(line))
+            # The highest frequency of an even grid has no sine: no odd derivative.
+            has_sine = (2 * np.abs(number) != n).reshape(line)
+            odd.append(jnp.where(has_sine, axes[d], 0))
         square = sum(k**2 for k in axes)
         power = kernel.spectrum(square)
         power = variance * power / jnp.sum(power)
-        # The highest frequency of an even grid has no sine: no odd derivative.
-        odd = [
-            jnp.where(2 * jnp.abs(k) * grid.spacing[d] >= 2 * jnp.pi, 0, k)
-            for d, k in enumerate(axes)
-        ]
         inverse = jnp.where(square > 0, 1 / jnp.where(square > 0, square, 1), 0)
         ascent = jnp.stack([jnp.broadcast_to(k * inverse, shape) for k in odd])
-        return Spectrum(power[..., :half], ascent[..., :half], shape)
+        variance = jnp.asarray(variance, power.dtype)
+        return Spectrum(power[..., :half], variance, ascent[..., :half], shape)
 
     def smooth(self, x: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
         """K x: the convolution with the kernel."""

@@ -135,8 +135,8 @@ class _Data(eqx.Module):
     def solve(self, b):
         """T^-1 b."""
         apply = lambda x: self.at(self.spectrum.smooth(self.spread(x))) + self.noise * x
-        # The diagonal of T is about this; padding keeps its zeros.
-        scale = 1 / (jnp.max(self.noise) + self.noise)
+        # One over the diagonal of T, but for the interpolation.
+        scale = 1 / (self.spectrum.variance + self.noise)
         return conjugate_gradients(
             apply,
             b,
@@ -144,6 +144,12 @@ class _Data(eqx.Module):
             max_steps=self.max_steps,
             preconditioner=lambda r: scale * r,
         )
+
+    def solved(self, rows):
+        """T^-1 of every row; NaN where the residual is above the tolerance."""
+        out = jax.vmap(self.solve)(rows)
+        good = (out.residual <= self.rtol)[:, None]
+        return jnp.where(good, out.value, jnp.nan)
 
     def field_of(self, alpha):
         """The field [x, y, z] of the coefficients alpha [3, n]."""
@@ -183,21 +189,21 @@ class Posterior(eqx.Module):
 
     def std(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The standard deviation at points, exact up to `rtol`: three linear systems
-        for each of them."""
+        for each of them; NaN where they did not converge."""
         data = self.data
 
         def variance(q):
             source = data.looking_at(q)
             seen = jax.vmap(data.at)(data.spectrum.vectors_from(source))
-            known = jnp.sum(seen * jax.vmap(data.solve)(seen).value)
+            known = jnp.sum(seen * data.solved(seen))
             return data.spectrum.variance_of(source) - known
 
         q = self.grid.index_of(points)
-        found = lax.map(variance, q, batch_size=_POINTS_TOGETHER)
-        return jnp.sqrt(jnp.maximum(found, 0))
+        return _root(lax.map(variance, q, batch_size=_POINTS_TOGETHER))
 
     def samples(self, key: Key[Array, ""], num: int) -> Float[Array, "s x y z"]:
-        """Fields [num, x, y, z] drawn from the posterior, at the nodes."""
+        """Fields [num, x, y, z] drawn from the posterior, at the nodes; NaN where a
+        linear system did not converge."""
         data, shape = self.data, self.grid.shape
 
         def one(key):
@@ -208,7 +214,7 @@ class Posterior(eqx.Module):
             v = jax.vmap(data.spectrum.color)(white)
             seen = jax.vmap(data.at)(v).T + jnp.sqrt(data.noise)[:, None] * error
             gap = jnp.where(data.real[:, None], self.normals - seen, 0)
-            alpha = jax.vmap(data.solve, in_axes=1)(gap).value
+            alpha = data.solved(gap.T)
             return data.anchored(data.spectrum.potential(v) + data.field_of(alpha))
 
         keys = jax.random.split(key, num)
@@ -218,7 +224,7 @@ class Posterior(eqx.Module):
         self, points: Float[Array, "m 3"]
     ) -> tuple[Float[Array, "m 3"], Float[Array, " m"]]:
         """The mean of the vector field at points, and the standard deviation of each of
-        its components (without noise)."""
+        its components (without noise; NaN where a linear system did not converge)."""
         data, spectrum = self.data, self.data.spectrum
         vectors = jax.vmap(lambda a: spectrum.smooth(data.spread(a)))(self.alpha)
         q = self.grid.index_of(points)
@@ -228,25 +234,34 @@ class Posterior(eqx.Module):
             source = splat(jnp.ones(1, q.dtype), q[None], spectrum.shape)
             smooth = spectrum.smooth(source)
             seen = data.at(smooth)
-            return jnp.vdot(source, smooth) - jnp.vdot(seen, data.solve(seen).value)
+            return jnp.vdot(source, smooth) - jnp.vdot(seen, data.solved(seen[None])[0])
 
-        found = lax.map(variance, q, batch_size=3 * _POINTS_TOGETHER)
-        return mean, jnp.sqrt(jnp.maximum(found, 0))
+        return mean, _root(lax.map(variance, q, batch_size=3 * _POINTS_TOGETHER))
 
     def probability_inside(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The probability that the field is negative at points."""
-        return norm.cdf(-self._standardized(points)[0])
+        mean = interpolate(self.values, self.grid.index_of(points))
+        return _inside(mean, self.std(points))
 
     def surface_density(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The density of the field at 0: how likely the surface passes there, per unit
         of the field."""
-        z, std = self._standardized(points)
-        return safe_divide(norm.pdf(z), std)
-
-    def _standardized(self, points):
         std = self.std(points)
         mean = interpolate(self.values, self.grid.index_of(points))
-        return safe_divide(mean, std), std
+        return safe_divide(norm.pdf(safe_divide(mean, std)), std)
+
+
+def _inside(mean, std):
+    """The probability that a Gaussian number is negative; of a sure one, 0 or 1."""
+    sure = std == 0
+    unsure = norm.cdf(-mean / jnp.where(sure, 1, std))
+    return jnp.where(sure, (mean < 0).astype(unsure.dtype), unsure)
+
+
+def _root(variance):
+    """The deviation; 0 with derivative 0 where rounding leaves no variance."""
+    some = ~(variance <= 0)
+    return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1)), 0)
 
 
 def probability_hit(
@@ -282,8 +297,7 @@ def view_score(
     **Arguments:** `origins`, `directions` (unit) of the rays, `length` that they are
     followed, in `num_steps` steps. Outside of the grid nothing is seen.
     """
-    mean, std = jnp.mean(samples, axis=0), jnp.std(samples, axis=0)
-    inside = norm.cdf(-safe_divide(mean, std))
+    inside = _inside(jnp.mean(samples, axis=0), jnp.std(samples, axis=0))
     step = length / num_steps
     t = (jnp.arange(num_steps) + 0.5) * step
     points = origins[:, None] + t[:, None] * directions[:, None]

@@ -134,6 +134,7 @@ def test_padding_has_no_influence(name):
     assert np.isfinite(nothing) and np.all(still == 0)
 
 
+@pytest.mark.slow
 def test_the_encoder_reads_a_set():
     cloud = jax.tree.map(jnp.asarray, ellipsoid_cloud())
     points = cloud.points.astype(jnp.float32)

@@ -54,6 +54,7 @@ def _check(devices):
     assert multigrid["memory"][-1] < multigrid["memory"][0] / 4
 
 
+@pytest.mark.slow
 def test_four_devices_solve_as_one_does():
     _check(4)
 

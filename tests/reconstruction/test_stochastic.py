@@ -237,11 +237,22 @@ def test_a_view_of_what_is_unknown_scores_high_and_has_a_slope(x64):
 
 def test_statuses_and_errors(x64):
     cloud, grid, _ = small()
+    few_steps = dict(rtol=1e-6, max_steps=300)
     few = PointCloud(cloud.points[:2], cloud.normals[:2])
     run = lambda c, **s: stochastic_poisson(c, grid, kernel=Matern(1.1), **s).result
     assert run(few) == RESULTS.too_few_points
     assert run(cloud, rtol=1e-12, max_steps=1) == RESULTS.not_converged
     assert run(cloud, weights=jnp.ones(6)) == RESULTS.successful
+    stopped = stochastic_poisson(
+        cloud, grid, kernel=Matern(1.1), max_steps=1, rtol=1e-9
+    )
+    assert np.isnan(stopped.std(cloud.points[:1])).all()
+    known = stochastic_poisson(cloud, grid, kernel=Matern(1.1), noise=1e-9, **few_steps)
+    slope = jax.grad(lambda x: jnp.sum(known.normals_at(x)[1]))(cloud.points)
+    assert np.isfinite(slope).all()
+    empty = jnp.ones((4, *SHAPE))
+    ray = (grid.origin[None] + 0.5, jnp.array([[1.0, 0.0, 0.0]]))
+    assert view_score(empty, grid, *ray, length=2.0) == 0
     with pytest.raises(GeometryError, match="with normals"):
         StochasticPoisson()(PointCloud(cloud.points), grid)
     out = stochastic_poisson(cloud, grid, weights=jnp.arange(6) > 0.0)
