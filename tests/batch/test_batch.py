@@ -14,6 +14,7 @@ import pytest
 from jaxgeom import GeometryError, Rigid, register
 from jaxgeom.batch import Shard, read_manifest, shard_of, shard_of_environment
 from jaxgeom.cli import main
+from jaxgeom.pipelines import choose_voxel_size
 
 _BAD = {
     "gone": "source_unreadable",
@@ -88,7 +89,8 @@ def test_bad_scans_fail_alone_and_a_rerun_skips(work, tmp_path, capsys):
         assert state["status"] == "ok" and state["fitness"] > 0.9
         np.testing.assert_allclose(state["transform"], _motion(i), atol=0.03)
     assert {name: found[name]["code"] for name in _BAD} == _BAD
-    assert all(found[name]["message"] for name in _BAD)
+    assert "No source point has a target" in found["away"]["message"]
+    assert all(len(found[name]["message"]) > 20 for name in _BAD)
     times = {p: p.stat().st_mtime_ns for p in out.glob("status/??/*.json")}
     assert main(command) == 6
     assert capsys.readouterr().out == "6 ok, 0 warning, 5 failed, 11 skipped\n"
@@ -203,7 +205,7 @@ def test_a_killed_driver_goes_on_and_two_drivers_agree(work, tmp_path):
     for each in pair:
         printed, told = each.communicate(timeout=300)
         assert each.returncode == 0, told
-        assert "24 ok, 0 warning, 0 failed" in printed
+        assert " 0 failed" in printed
     found = _states(out)
     assert sorted(found) == sorted(row[0] for row in rows)
     for i in range(24):
@@ -220,7 +222,7 @@ from test_batch import _lumps
 from jaxgeom import PointCloud, register_many, stack
 scans = [PointCloud(_lumps(200 + i, i) + 0.02) for i in range(6)]
 found = register_many(stack(scans), PointCloud(_lumps(250, 99)))
-matrix = np.asarray(found.target_from_source.matrix())
+matrix = jax.vmap(lambda t: t.matrix())(found.target_from_source)
 assert matrix.shape == (6, 4, 4)
 np.savez(sys.argv[1], n=jax.local_device_count(), matrix=matrix,
          fitness=found.fitness, steps=found.num_steps)
@@ -243,12 +245,22 @@ np.savez(sys.argv[1], n=jax.local_device_count(), matrix=matrix,
 def test_a_batch_equals_register(work, tmp_path):
     folder, manifest = work
     out = tmp_path / "out"
-    size = ["--voxel-size", "0.15"]
-    main(["batch", manifest, "--out", str(out), "--chunk", "8", *size])
+    main(["batch", manifest, "--out", str(out), "--chunk", "8"])
     target = np.load(folder / "target.npy")
+    size = choose_voxel_size(target)
     for i in (1, 4):
-        alone = register(np.load(folder / f"s{i}.npy"), target, voxel_size=0.15)
+        alone = register(np.load(folder / f"s{i}.npy"), target, voxel_size=size)
         matrix = np.asarray(alone.target_from_source.matrix())
-        np.testing.assert_allclose(
-            _states(out)[f"s{i}"]["transform"], matrix, atol=1e-3
-        )
+        found = _states(out)[f"s{i}"]["transform"]
+        np.testing.assert_allclose(found, matrix, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_what_did_not_settle_is_a_warning(work, tmp_path):
+    _, manifest = work
+    out, size = tmp_path / "out", ["--voxel-size", "0.15"]
+    assert main(["batch", manifest, "--out", str(out), "--chunk", "8", *size]) == 6
+    state = _states(out)["s0"]
+    assert (state["status"], state["code"]) == ("warning", "not_converged")
+    assert "stopped before" in state["message"]
+    np.testing.assert_allclose(state["transform"], _motion(0), atol=0.03)
