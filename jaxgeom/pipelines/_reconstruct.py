@@ -78,7 +78,7 @@ def reconstruct(
 
     - `cloud`: a `PointCloud`, or points [n, 3] in any unit.
     - `resolution`: nodes along each side of the cube around the cloud.
-    - `method`: `ScreenedPoisson()` by default, or `Poisson()`.
+    - `method`: `ScreenedPoisson()` by default, `Poisson()`, `SSD()` or `Wavelet()`.
     - `extractor`: by default `MarchingCubes` with cubic placement and the asymptotic
       decider.
     - `weights`: [n] confidence of the points.

@@ -15,8 +15,10 @@ from ._poisson import screened_poisson as screened_poisson
 from ._solution import FieldSolution as FieldSolution
 from ._solution import PoissonStats as PoissonStats
 from ._spread import spread as spread
+from ._ssd import SSD as SSD
 from ._stochastic import Posterior as Posterior
 from ._stochastic import StochasticPoisson as StochasticPoisson
 from ._stochastic import probability_hit as probability_hit
 from ._stochastic import stochastic_poisson as stochastic_poisson
 from ._stochastic import view_score as view_score
+from ._wavelet import Wavelet as Wavelet

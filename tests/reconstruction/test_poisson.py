@@ -8,13 +8,16 @@ import pytest
 
 from jaxgeom import RESULTS, Grid, PointCloud
 from jaxgeom.reconstruction import (
+    SSD,
     Dirichlet,
     Envelope,
     Poisson,
     ScreenedPoisson,
+    Wavelet,
     poisson,
     screened_poisson,
 )
+from jaxgeom.reconstruction._wavelet import indicator
 
 RESOLUTION = 32
 MAJOR, MINOR = 1.3, 0.55
@@ -56,8 +59,7 @@ def _surface_error(out):
 METHODS = [Poisson(), ScreenedPoisson(), ScreenedPoisson(screening=4.0)]
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_field_has_the_sign_and_the_place_of_the_torus(method):
+def _field_with_the_sign_of_the_torus(method):
     cloud = _torus(6000)
     out = jax.jit(method)(cloud, _grid(cloud))
     assert out.result == RESULTS.successful
@@ -65,9 +67,59 @@ def test_field_has_the_sign_and_the_place_of_the_torus(method):
     clear = np.abs(distance) > 2 * float(out.grid.spacing[0])
     sign = np.asarray(out.values) > float(out.level)
     assert (sign == (distance > 0))[clear].all()
+    return out, distance
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_field_has_the_sign_and_the_place_of_the_torus(method):
+    out, distance = _field_with_the_sign_of_the_torus(method)
     assert _surface_error(out) < 0.12
     inside = np.asarray(out.values)[distance < -0.4]
     np.testing.assert_allclose(inside - float(out.level), -0.5, atol=0.12)
+
+
+@pytest.mark.slow
+def test_wavelets_have_the_sign_and_the_place_of_the_torus():
+    out, distance = _field_with_the_sign_of_the_torus(Wavelet())
+    assert _surface_error(out) < 0.12
+    inside, outside = (
+        np.mean(np.asarray(out.values)[side])
+        for side in (distance < -0.4, distance > 0.4)
+    )
+    np.testing.assert_allclose(outside - inside, 1, atol=0.06)
+
+
+def test_wavelets_of_a_box_are_its_share_of_every_cell():
+    """Fluxes are constant over half-cells of faces: sums at their middles are exact."""
+    shape = (13, 10, 12)
+    low, high = np.array([2.25, 3.5, 1.75]), np.array([9.75, 6.25, 11.0])
+    points, vectors = [], []
+    for d in range(3):
+        lines = [np.arange(a + 0.125, b, 0.25) for a, b in zip(low, high, strict=True)]
+        for end, sign in ((low, -1), (high, 1)):
+            lines[d] = end[d : d + 1]
+            face = np.stack(np.meshgrid(*lines, indexing="ij"), -1).reshape(-1, 3)
+            points.append(face)
+            vectors.append(sign / 16 * np.tile(np.eye(3)[d], (len(face), 1)))
+    found = jax.jit(indicator, static_argnums=2)(
+        np.float32(np.concatenate(points)), np.float32(np.concatenate(vectors)), shape
+    )
+    nodes = [np.arange(n) for n in shape]
+    x, y, z = (
+        np.clip(np.minimum(i + 0.5, b) - np.maximum(i - 0.5, a), 0, 1)
+        for i, a, b in zip(nodes, low, high, strict=True)
+    )
+    share = x[:, None, None] * y[:, None] * z
+    np.testing.assert_allclose(found, share, atol=1e-5)
+
+
+def test_smooth_signed_distance_is_the_distance_near_the_samples():
+    out, distance = _field_with_the_sign_of_the_torus(SSD())
+    assert _surface_error(out) < 0.06
+    h = float(out.grid.spacing[0])
+    values = np.asarray(out.values) - float(out.level)
+    near = np.abs(distance) < 1.5 * h
+    assert np.sqrt(np.mean((values - distance)[near] ** 2)) < 0.2 * h
 
 
 def test_areas_sum_to_the_area_of_the_surface():
@@ -104,13 +156,16 @@ def test_fixed_nodes_are_outside(boundary):
 
 
 @pytest.mark.slow
-def test_padding_changes_nothing_and_has_no_gradient():
+@pytest.mark.parametrize(
+    "method",
+    [ScreenedPoisson(screening=2.0, levels=1), Wavelet(levels=1), SSD(levels=1)],
+)
+def test_padding_changes_nothing_and_has_no_gradient(method):
     cloud = _torus(1500)
     grid = _grid(cloud)
     pad = lambda x: jnp.concatenate([jnp.asarray(x), jnp.full((300, 3), jnp.nan)])
     mask = jnp.arange(1800) < 1500
     padded = PointCloud(pad(cloud.points), pad(cloud.normals), mask)
-    method = ScreenedPoisson(screening=2.0, levels=1)
 
     def total(points, normals, mask):
         values = method(PointCloud(points, normals, mask), grid).values
@@ -138,16 +193,24 @@ def test_weights_are_confidence():
     assert _surface_error(run(both, grid)) > 2 * _surface_error(out)
 
 
+# The step of the differences: the fourth order of SSD amplifies rounding errors.
+_MAKERS = [
+    (lambda w: ScreenedPoisson(w, levels=1, rtol=1e-12, max_steps=200), 1e-7),
+    (lambda w: SSD(w, levels=1, rtol=1e-12, max_steps=400), 1e-5),
+    (lambda w: Wavelet(levels=1), 1e-7),
+]
+
+
 @pytest.mark.slow
-def test_gradients_are_central_differences(x64):
+@pytest.mark.parametrize(("make", "step"), _MAKERS)
+def test_gradients_are_central_differences(make, step, x64):
     cloud = _torus(700, dtype=np.float64)
     grid = _grid(cloud)
     rng = np.random.default_rng(1)
     probe = jnp.asarray(rng.normal(size=grid.shape))
 
     def loss(points, normals, weights, screening):
-        method = ScreenedPoisson(screening, levels=1, rtol=1e-12, max_steps=200)
-        out = method(PointCloud(points, normals), grid, weights=weights)
+        out = make(screening)(PointCloud(points, normals), grid, weights=weights)
         return jnp.vdot(probe, out.values) + 10 * out.level
 
     args = [jnp.asarray(a) for a in (cloud.points, cloud.normals, np.ones(700), 3.0)]
@@ -156,7 +219,7 @@ def test_gradients_are_central_differences(x64):
     moved = jax.jit(lambda i, t: loss(*_shift(args, ways, i, t)))
     for i in range(4):
         mask = jnp.arange(4) == i
-        central = (moved(mask, 1e-7) - moved(mask, -1e-7)) / 2e-7
+        central = (moved(mask, step) - moved(mask, -step)) / (2 * step)
         np.testing.assert_allclose(
             jnp.vdot(gradient[i], ways[i]), central, rtol=1e-5, atol=1e-7
         )
@@ -185,6 +248,22 @@ def test_statuses():
     assert run(cloud, grid) == RESULTS.successful
     early = jax.jit(ScreenedPoisson(max_steps=1, rtol=1e-6, levels=0))(cloud, grid)
     assert early.result == RESULTS.not_converged
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [Wavelet(levels=0), SSD(levels=0)])
+def test_vmap_is_a_loop(method):
+    clouds = [_torus(800, seed) for seed in (0, 1)]
+    grid = _grid(clouds[0])
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *clouds)
+    many = jax.jit(jax.vmap(lambda c: method(c, grid)))(stacked)
+    assert np.asarray(many.result == RESULTS.successful).tolist() == [True, True]
+    one = jax.jit(method)
+    for i, cloud in enumerate(clouds):
+        alone = one(cloud, grid)
+        np.testing.assert_allclose(many.values[i], alone.values, atol=1e-4)
+        assert many.stats.steps[i] == alone.stats.steps
+        assert alone.result == RESULTS.successful
 
 
 @pytest.mark.slow
