@@ -210,16 +210,18 @@ def _given_start(scan):
 
 
 def _verdict(item):
-    """The status, code and text of an alignment."""
+    """The status, code and text of an alignment.
+
+    One that came near but did not settle is a warning: its transform can be used.
+    """
     code = _code(item.result)
-    if code == "max_steps_reached":
-        return "warning", code, RESULTS[item.result]
-    if code != "successful":
-        return "failed", code, RESULTS[item.result]
+    text = RESULTS[getattr(RESULTS, code)]
+    if code not in {"successful", "not_converged"}:
+        return "failed", code, text
     if float(item.fitness) < _LOW_FITNESS:
         text = f"only {100 * float(item.fitness):.0f} % of the source has a partner"
         return "warning", "low_fitness", text
-    return "ok", code, ""
+    return ("warning", code, text) if code == "not_converged" else ("ok", code, "")
 
 
 def _code(result):
