@@ -3,18 +3,15 @@
 python experiments/linear/slabs.py 256
 """
 
-import os
 import sys
 
-os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=8"
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-from jax.sharding import Mesh, NamedSharding  # noqa: E402
-from jax.sharding import PartitionSpec as P  # noqa: E402
-
-from jaxgeom.linear import SlabCosine, SlabMultigrid, solve_in_slabs  # noqa: E402
+from jaxgeom.linear import SlabCosine, SlabMultigrid, solve_in_slabs
 
 
 def memory(resolution, devices, method):
@@ -37,6 +34,7 @@ def memory(resolution, devices, method):
 
 def main():
     """Print one row for each number of devices."""
+    jax.config.update("jax_num_cpu_devices", 8)
     resolution = int(sys.argv[1])
     for devices in (1, 2, 4, 8):
         sizes = [

@@ -17,6 +17,7 @@ import time
 
 import equinox as eqx
 import jax.numpy as jnp
+import methods
 import numpy as np
 import open3d as o3d
 import trimesh
@@ -26,7 +27,7 @@ from jaxgeom.io import load_cloud
 from jaxgeom.meshes import topology
 from jaxgeom.normals import LocalPlanes, WindingConsistency
 from jaxgeom.pipelines import IteratedPoisson
-from jaxgeom.render import Camera, render_mesh, save_png, side_by_side
+from jaxgeom.render import save_png, side_by_side
 from jaxgeom.shapes import PointCloud
 
 METHODS = {
@@ -163,8 +164,7 @@ def _view(points, mesh, side):
         mesh,
         ((np.asarray(mesh.vertices) - center) / size).astype(np.float32),
     )
-    eye = 1.9 * np.asarray(side) / np.linalg.norm(side)
-    return render_mesh(unit, Camera(jnp.float32(eye), jnp.zeros(3)), size=(360, 360))
+    return methods.view(unit, side)
 
 
 def main():

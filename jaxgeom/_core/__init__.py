@@ -17,3 +17,4 @@ from ._stage import stage as stage
 from ._status import RESULTS as RESULTS
 from ._status import failure_where as failure_where
 from ._status import first_failure as first_failure
+from ._status import name_of as name_of

@@ -21,6 +21,12 @@ class RESULTS(optx.RESULTS):
     not_converged = "The solver stopped before the residual fell below rtol."
 
 
+def name_of(result: RESULTS) -> str:
+    """The name of one status, for programs; `RESULTS[result]` is its text (host)."""
+    items = RESULTS._name_to_item.items()
+    return next(name for name, item in items if bool(result == item))
+
+
 def first_failure(*results: RESULTS) -> RESULTS:
     """The first status that is not successful, or success."""
     out = results[-1]

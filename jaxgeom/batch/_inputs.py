@@ -126,8 +126,7 @@ def _bad_init(given):
     return Refused("bad_init", text)
 
 
-def hash_of(source: str, target: str, start: Rigid | None, settings) -> str:
+def hash_of(source: str, target: str, settings) -> str:
     """The hash of all that the result of a scan depends on."""
-    rows = None if start is None else np.asarray(start.matrix(), np.float64).tolist()
-    text = json.dumps([source, target, rows, settings], sort_keys=True, default=str)
+    text = json.dumps([source, target, settings], sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()

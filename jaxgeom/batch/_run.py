@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from .. import __version__
-from .._core import RESULTS, GeometryError, message
+from .._core import RESULTS, GeometryError, message, name_of
 from ..shapes import PointCloud
 from ..transforms import Rigid
 from ._chunks import Chunks, Key, align_chunk, size_bucket
@@ -110,7 +110,7 @@ class _Run:
             begin = _given_start(scan)
             size = scan.voxel_size
             told = {**self.choices, "own_voxel_size": size, "init": begin}
-            input_hash = hash_of(source_digest, target.digest, None, told)
+            input_hash = hash_of(source_digest, target.digest, told)
             if self._is_finished(scan.id, input_hash):
                 return
             source = read_points(scan.source, "source")
@@ -214,7 +214,8 @@ def _verdict(item):
 
     One that came near but did not settle is a warning: its transform can be used.
     """
-    code = _code(item.result)
+    code = name_of(item.result)
+    # A result of numbers, as arrays on the host leave it, does not tell its text.
     text = RESULTS[getattr(RESULTS, code)]
     if code not in {"successful", "not_converged"}:
         return "failed", code, text
@@ -222,11 +223,6 @@ def _verdict(item):
         text = f"only {100 * float(item.fitness):.0f} % of the source has a partner"
         return "warning", "low_fitness", text
     return ("warning", code, text) if code == "not_converged" else ("ok", code, "")
-
-
-def _code(result):
-    names = RESULTS._name_to_item
-    return next(name for name, item in names.items() if bool(result == item))
 
 
 def _facts(item):

@@ -40,11 +40,12 @@ def shard_of_environment(variables) -> Shard:
     **Arguments:**
 
     - `variables`: a mapping such as `os.environ`. Read are SLURM_ARRAY_TASK_ID with
-      _COUNT, _MIN and _STEP; JOB_COMPLETION_INDEX with JOB_COMPLETIONS, which the
-      job's description must set; AWS_BATCH_JOB_ARRAY_INDEX with _SIZE.
+      _COUNT, _MIN and _MAX; JOB_COMPLETION_INDEX with JOB_COMPLETIONS, which the job's
+      description must set; AWS_BATCH_JOB_ARRAY_INDEX with _SIZE.
 
     The whole manifest where none is set. Raises `GeometryError` for an index without
-    its count.
+    its count, and for a Slurm array that does not run from 0 or 1 without gaps: it may
+    be a part of the array that began the work, whose shares were others.
     """
     for index, count in _PAIRS:
         if index not in variables:
@@ -56,9 +57,10 @@ def shard_of_environment(variables) -> Shard:
             place, total = int(variables[index]), int(variables[count])
             if index.startswith("SLURM"):
                 first = int(variables.get("SLURM_ARRAY_TASK_MIN", 0))
-                place = (place - first) // int(
-                    variables.get("SLURM_ARRAY_TASK_STEP", 1)
-                )
+                last = int(variables.get("SLURM_ARRAY_TASK_MAX", first + total - 1))
+                if first > 1 or last - first + 1 != total:
+                    raise _bad_shard(f"a Slurm array of {total} from {first} to {last}")
+                place = place - first
         except ValueError:
             given = f"{index}={variables[index]}, {count}={variables[count]}"
             raise _bad_shard(given) from None

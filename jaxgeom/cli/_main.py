@@ -9,6 +9,7 @@ import os
 import sys
 
 from .. import __version__
+from . import _values as values
 
 OK, INTERNAL, USAGE, FILE, DATA, CHECK, SOME, INTERRUPTED = 0, 1, 2, 3, 4, 5, 6, 130
 
@@ -89,7 +90,7 @@ def _add_demo(commands):
         "demo", help="make a statue, scan it with noise, reconstruct and check it"
     )
     demo.add_argument("--out", default="demo", metavar="DIR", help="folder (demo)")
-    demo.add_argument("--resolution", type=_resolution, default=128, metavar="N")
+    demo.add_argument("--resolution", type=values.resolution, default=128, metavar="N")
     demo.add_argument("--seed", type=int, default=0)
 
 
@@ -107,29 +108,31 @@ def _add_surface(command):
     """The options of every command that makes a mesh."""
     command.add_argument("-o", "--output", required=True, metavar="MESH")
     size = command.add_mutually_exclusive_group()
-    size.add_argument("--resolution", type=_resolution, metavar="N", help="nodes (128)")
-    size.add_argument("--depth", type=_depth, metavar="D", help="resolution 2^D")
+    size.add_argument(
+        "--resolution", type=values.resolution, metavar="N", help="nodes (128)"
+    )
+    size.add_argument("--depth", type=values.depth, metavar="D", help="resolution 2^D")
     command.add_argument(
         "--point-weight",
-        type=_nonnegative,
+        type=values.nonnegative,
         metavar="W",
         help="screening weight; 0 for plain Poisson (default: from the noise)",
     )
     command.add_argument(
         "--scale",
-        type=_scale,
+        type=values.scale,
         default=1.1,
         help="side of the cube / longest side (1.1)",
     )
     command.add_argument(
         "--trim",
-        type=_nonnegative,
+        type=values.nonnegative,
         metavar="T",
         help="cut where samples are sparser than T x the median density",
     )
     command.add_argument(
         "--min-component",
-        type=_nonnegative,
+        type=values.nonnegative,
         default=0.01,
         metavar="F",
         help="drop bodies below this share of the largest (0.01; 0 keeps all)",
@@ -183,7 +186,11 @@ def _add_batch(commands):
     )
     command.add_argument("--retry-failed", action="store_true")
     command.add_argument(
-        "--chunk", type=_chunk, default=64, metavar="B", help="scans in one call (64)"
+        "--chunk",
+        type=values.chunk,
+        default=64,
+        metavar="B",
+        help="scans in one call (64)",
     )
     _add_alignment(command)
     status = commands.add_parser("batch-status", help="how the scans of a batch ended")
@@ -207,12 +214,12 @@ def _add_alignment(command):
     )
     command.add_argument(
         "--max-correspondence-distance",
-        type=_distance,
+        type=values.distance,
         metavar="D",
         help="at the finest level: a length, or 2%% of the target's diagonal",
     )
     command.add_argument(
-        "--voxel-size", type=_positive, metavar="V", help="of the finest level"
+        "--voxel-size", type=values.positive, metavar="V", help="of the finest level"
     )
     command.add_argument("--with-scale", action="store_true", help="also find a scale")
     command.add_argument(
@@ -234,7 +241,7 @@ def _add_fuse(commands):
     )
     command.add_argument(
         "--voxel-size",
-        type=_positive,
+        type=values.positive,
         metavar="V",
         help="of the finest level, in the unit of the points (1/160 of a scan)",
     )
@@ -253,7 +260,7 @@ def _add_mesh(commands):
     command.add_argument("-o", "--output", required=True, metavar="MESH")
     command.add_argument(
         "--resolution",
-        type=_mesh_resolution,
+        type=values.mesh_resolution,
         default=128,
         metavar="N",
         help="nodes along the longest side (128)",
@@ -271,12 +278,14 @@ def _add_mesh(commands):
     )
     command.add_argument(
         "--tolerance",
-        type=_nonnegative,
+        type=values.nonnegative,
         default=0.0,
         metavar="T",
         help="dual-contouring, dual-grid: larger faces, up to this error (0: none)",
     )
-    command.add_argument("--level", type=_finite, default=0.0, help="of the field (0)")
+    command.add_argument(
+        "--level", type=values.finite, default=0.0, help="of the field (0)"
+    )
     _add_bounds(command)
     command.add_argument("--report", metavar="JSON", help="parameters, sizes, checks")
 
@@ -284,7 +293,7 @@ def _add_mesh(commands):
 def _add_bounds(command):
     command.add_argument(
         "--bounds",
-        type=_bounds,
+        type=values.bounds,
         metavar="XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX",
         help="the box to look at (default: the field's own; write --bounds=-1,...)",
     )
@@ -306,48 +315,3 @@ def _add_pictures(commands):
             command.add_argument("--size", type=int, default=800, help="pixels (800)")
             command.add_argument("--azimuth", type=float, default=-60.0)
             command.add_argument("--elevation", type=float, default=20.0)
-
-
-def _distance(text):
-    """A length, or a share of a size as the negative of a percentage."""
-    percent = text.endswith("%")
-    value = _positive(text.rstrip("%"))
-    return -value / 100 if percent else value
-
-
-def _bounds(text):
-    """Six numbers, low and high of each axis."""
-    try:
-        values = [float(x) for x in text.split(",")]
-    except ValueError:
-        values = []
-    ends = zip(values[::2], values[1::2], strict=False)
-    if len(values) != 6 or not all(-1e12 < a < b < 1e12 for a, b in ends):
-        raise argparse.ArgumentTypeError(
-            f"must be six numbers xmin,xmax,... with each min below its max, given "
-            f"{text!r}"
-        )
-    return values
-
-
-def _number(kind, low, high, what):
-    def parse(text):
-        try:
-            value = kind(text)
-        except ValueError:
-            value = None
-        if value is None or not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"must be {what}, given {text!r}")
-        return value
-
-    return parse
-
-
-_chunk = _number(int, 1, 4096, "a whole number from 1 to 4096")
-_resolution = _number(int, 8, 4096, "a whole number from 8 to 4096")
-_mesh_resolution = _number(int, 8, 1024, "a whole number from 8 to 1024")
-_finite = _number(float, -1e12, 1e12, "a number")
-_depth = _number(int, 3, 12, "a whole number from 3 to 12")
-_nonnegative = _number(float, 0.0, 1e9, "a number of at least 0")
-_positive = _number(float, 1e-12, 1e12, "a number above 0")
-_scale = _number(float, 1.01, 10.0, "a number from 1.01 to 10")

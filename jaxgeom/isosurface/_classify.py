@@ -61,21 +61,17 @@ def classify(
     corners = stage(token, corner_words, bits.inside)
     num_faces = stage(token, count_faces, corners, bits.cells)
     decided = rule(values, level, token)
-    if decided.joined is not None:
-        joined = stage(token, _on_ambiguous, decided.joined, corners, bits.inside)
-        bits = eqx.tree_at(lambda b: b.joined, bits, joined, is_leaf=_is_none)
+    joined, tunnels = decided.joined, decided.tunnels
+    if joined is not None:
+        joined = stage(token, _on_ambiguous, joined, corners, bits.inside)
         # A join leaves at most one loop fewer, two triangles more, in either cell.
         num_faces = num_faces + 4 * jnp.sum(popcount(joined))
-    if decided.tunnels is not None:
-        tunnels = decided.tunnels & bits.cells
-        bits = eqx.tree_at(lambda b: b.tunnels, bits, tunnels, is_leaf=_is_none)
+    if tunnels is not None:
+        tunnels = tunnels & bits.cells
         # A tube between two loops has four triangles more than two discs.
         num_faces = num_faces + 4 * jnp.sum(popcount(tunnels))
+    bits = Bits(bits.inside, bits.cut, bits.cells, bits.finite, joined, tunnels)
     return bits, stage(token, _number, bits, num_faces)
-
-
-def _is_none(x):
-    return x is None
 
 
 def _on_ambiguous(decided, corners, inside):

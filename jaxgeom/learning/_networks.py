@@ -48,13 +48,9 @@ class NeuralField(AbstractField):
 
         `bandwidth`: standard deviation of the frequencies, in waves per unit.
         """
-        key_features, key_network = jax.random.split(key)
-        features = FourierFeatures.random(
-            num_frequencies, bandwidth=bandwidth, key=key_features
-        )
-        sizes = (features.size(), *[width] * depth, 1)
-        network = perceptron(sizes, Softplus(), key=key_network)
-        return NeuralField(features, network, jnp.asarray(radius, float))
+        features = (num_frequencies, bandwidth)
+        parts = _on_fourier_features(0, features, [width] * depth, key)
+        return NeuralField(*parts, jnp.asarray(radius, float))
 
     @staticmethod
     def siren(
@@ -101,13 +97,9 @@ class Decoder(eqx.Module):
         radius: float = 0.35,
     ) -> "Decoder":
         """`depth` hidden layers of `width` softplus units on code and features."""
-        key_features, key_network = jax.random.split(key)
-        features = FourierFeatures.random(
-            num_frequencies, bandwidth=bandwidth, key=key_features
-        )
-        sizes = (code_size + features.size(), *[width] * depth, 1)
-        network = perceptron(sizes, Softplus(), key=key_network)
-        return Decoder(features, network, jnp.asarray(radius, float), code_size)
+        features = (num_frequencies, bandwidth)
+        parts = _on_fourier_features(code_size, features, [width] * depth, key)
+        return Decoder(*parts, jnp.asarray(radius, float), code_size)
 
     def __call__(
         self, code: Float[Array, " c"], point: Float[Array, " 3"]
@@ -149,6 +141,15 @@ class Unsigned(AbstractField):
 
     def claims(self):
         return Claims.unknown()
+
+
+def _on_fourier_features(num_more, frequencies, widths, key):
+    """Fourier features, and a perceptron that reads them after `num_more` numbers."""
+    key_features, key_network = jax.random.split(key)
+    number, bandwidth = frequencies
+    features = FourierFeatures.random(number, bandwidth=bandwidth, key=key_features)
+    sizes = (num_more + features.size(), *widths, 1)
+    return features, perceptron(sizes, Softplus(), key=key_network)
 
 
 def sphere_start(point, radius):

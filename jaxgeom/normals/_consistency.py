@@ -8,9 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import safe_normalize
-from ..clouds import nearest_graph
+from ..clouds import bounding_box, nearest_graph
 from ..linear import interpolate
-from ..neighbors._morton import bounds
 from ..shapes import PointCloud
 from ._estimate import estimate, local_normals
 from ._orient import orient_consistently
@@ -72,9 +71,9 @@ class WindingConsistency(AbstractOrientation):
     def measured(self, cloud: PointCloud) -> Oriented:
         """The cloud with normals, and the confidence of each."""
         points = jax.lax.stop_gradient(cloud.washed().points)
-        low, high = bounds(points, cloud.mask)
-        side = jnp.max(high - low)
-        unit = (points - (low + high) / 2) / jnp.where(side > 0, side, 1) + 0.5
+        box = jax.lax.stop_gradient(bounding_box(cloud))
+        side = 2 * jnp.max(box.half_extents)
+        unit = (points - box.center) / jnp.where(side > 0, side, 1) + 0.5
         unit = jnp.where(cloud.mask[:, None], unit, 0.5)
         # For coincident points any width serves; one that only the data decides keeps
         # the compiler from transforming the kernel itself, which takes it minutes.
@@ -94,7 +93,7 @@ class WindingConsistency(AbstractOrientation):
             interpolate(field, winding.q + sign * reach) for sign in (-1, 1)
         )
         fall = jnp.where(cloud.mask, jnp.clip(inside - outside, 0, 1), 0)
-        return Oriented(_with(cloud, normals), fall)
+        return Oriented(cloud.with_normals(normals), fall)
 
     def _turned(self, cloud, outward):
         if self.k is None:
@@ -103,7 +102,3 @@ class WindingConsistency(AbstractOrientation):
         planes = jax.lax.stop_gradient(planes)
         inward = jnp.sum(planes * outward, axis=-1, keepdims=True) < 0
         return jnp.where(inward, -planes, planes)
-
-
-def _with(cloud, normals):
-    return eqx.tree_at(lambda c: c.normals, cloud, normals, is_leaf=lambda x: x is None)

@@ -1,6 +1,5 @@
 """Normals from the local plane of the k nearest points."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -27,7 +26,7 @@ def estimate(
     Source: Hoppe et al. 1992, Surface reconstruction from unorganized points, 3.1.
     """
     normals = local_normals(cloud, nearest_graph(cloud, k, backend=backend))
-    return eqx.tree_at(lambda c: c.normals, cloud, normals, is_leaf=lambda x: x is None)
+    return cloud.with_normals(normals)
 
 
 def plane_residual(cloud: PointCloud, *, k: int = 16) -> Float[Array, " n"]:

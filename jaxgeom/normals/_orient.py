@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -26,7 +25,7 @@ def orient_toward_viewpoint(
     """
     normals = _normals_of(cloud)
     toward = jnp.sum(normals * (jnp.asarray(viewpoint) - cloud.points), axis=-1)
-    return _with_normals(cloud, jnp.where((toward < 0)[:, None], -normals, normals))
+    return cloud.with_normals(jnp.where((toward < 0)[:, None], -normals, normals))
 
 
 def orient_consistently(
@@ -54,7 +53,7 @@ def orient_consistently(
     outward = _outward(points, cloud.mask, capacity, steps)
     guess = jnp.sum(fixed * outward, axis=-1)
     sign = _majority(_signs(guess), fixed, jax.lax.stop_gradient(near), votes)
-    return _with_normals(cloud, normals * sign[:, None])
+    return cloud.with_normals(normals * sign[:, None])
 
 
 @partial(jax.jit, static_argnames=("capacity", "steps"))
@@ -113,7 +112,3 @@ def _normals_of(cloud):
             )
         )
     return jnp.asarray(cloud.normals)
-
-
-def _with_normals(cloud, normals):
-    return eqx.tree_at(lambda c: c.normals, cloud, normals, is_leaf=lambda x: x is None)

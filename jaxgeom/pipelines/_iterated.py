@@ -40,7 +40,7 @@ class IteratedPoisson(AbstractOrientation):
 
         def round_(state):
             normals, _, rounds = state
-            field = self.method(_with(cloud, normals), grid)
+            field = self.method(cloud.with_normals(normals), grid)
             rise = [
                 interpolate(slope, q)
                 for slope in jnp.gradient(field.values, *grid.spacing)
@@ -56,8 +56,4 @@ class IteratedPoisson(AbstractOrientation):
         first = jax.lax.stop_gradient(start(cloud).normals)
         far = jnp.full((), jnp.inf, first.dtype)
         normals, _, _ = jax.lax.while_loop(turning, round_, (first, far, 0))
-        return _with(cloud, jax.lax.stop_gradient(normals))
-
-
-def _with(cloud, normals):
-    return eqx.tree_at(lambda c: c.normals, cloud, normals, is_leaf=lambda x: x is None)
+        return cloud.with_normals(jax.lax.stop_gradient(normals))

@@ -22,22 +22,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._core import (
-    RESULTS,
-    failure_where,
-    first_failure,
-    safe_divide,
-    safe_normalize,
-)
-from ..linear import LinearSolution, cosine_solve, interpolate
+from ..linear import LinearSolution, cosine_solve
 from ..shapes import Grid, PointCloud
 from ._boundary import AbstractBoundary, Neumann
-from ._density import sample_geometry
-from ._divergence import divergence, levels_for
+from ._divergence import divergence
+from ._measured import Measured, without_steps
 from ._minimise import minimise
-from ._solution import FieldSolution, PoissonStats
-
-_FEWEST_POINTS = 4
+from ._solution import FieldSolution
 
 
 class Poisson(eqx.Module):
@@ -120,81 +111,26 @@ def screened_poisson(
     return method(cloud, grid, weights=weights, token=token)
 
 
-class _Samples(eqx.Module):
-    """The usable samples in node indices, with normals in units of the mean spacing."""
-
-    q: Float[Array, "n 3"]
-    normals: Float[Array, "n 3"]
-    real: Bool[Array, " n"]
-    result: RESULTS
-    num_ignored: Array
-
-
 def _solve(cloud, grid, method, screening, weights, token) -> FieldSolution:
-    shape, levels = grid.shape, method.levels
-    if levels is None:
-        levels = levels_for(cloud.points.shape[0], shape)
-    samples = prepared_samples(cloud, grid)
-    unit = jnp.prod(grid.spacing) ** (1 / 3)
-    found = sample_geometry(
-        samples.q, samples.normals, samples.real, shape, levels=levels, token=token
-    )
+    seen = Measured.of(cloud, grid, weights, method.levels, token)
+    found, ratios = seen.geometry, seen.unit / grid.spacing
     if screening is None:
         screening = _screening_for(found.noise)
-    strength = found.area if weights is None else found.area * weights
-    vectors = samples.normals * (unit / grid.spacing) * strength[:, None]
-    side = divergence(samples.q, vectors, found.area, shape, levels, token=token)
-    coefficients = (unit / grid.spacing) ** 2
+    vectors = seen.normals * ratios * seen.strength[:, None]
+    side = divergence(seen.q, vectors, found.area, grid.shape, seen.levels, token=token)
     # A sample of many cells belongs to a coarser grid, whose 1 / h is weaker.
-    pull = screening * strength / jnp.sqrt(jnp.maximum(found.area, 1.0))
-    solution = _minimiser(side, samples.q, pull, coefficients, method, token)
-    at_samples = interpolate(solution.value, samples.q)
-    level = safe_divide(jnp.sum(strength * at_samples), jnp.sum(strength))
-    stats = PoissonStats(
-        solution.residual,
-        solution.steps,
-        screening,
-        found.noise * unit,
-        found.area * unit**2,
-        samples.num_ignored,
-    )
-    result = first_failure(samples.result, solution.result)
-    density = found.density / unit**2
-    return FieldSolution(grid, solution.value, level, density, result, stats)
+    pull = screening * seen.strength / jnp.sqrt(jnp.maximum(found.area, 1.0))
+    solution = _minimiser(side, seen.q, pull, ratios**2, method, token)
+    return seen.answer(solution, screening)
 
 
 def _minimiser(side, q, pull, coefficients, method, token) -> LinearSolution:
     fixed = method.boundary.fixed(side.shape)
     if fixed is None and isinstance(method, Poisson):
         value = cosine_solve(side, coefficients)
-        zero = jnp.zeros((), value.dtype)
-        return LinearSolution(value, zero, jnp.int32(0), RESULTS.successful)
+        return without_steps(value)
     settings = dict(rtol=method.rtol, max_steps=method.max_steps, token=token)
     return minimise(side, q, pull, coefficients, fixed, **settings)
-
-
-def prepared_samples(cloud, grid) -> _Samples:
-    """Drop what cannot be used, and say so."""
-    cloud = cloud.washed()
-    finite = jnp.isfinite(cloud.points).all(-1) & jnp.isfinite(cloud.normals).all(-1)
-    points = jnp.where(finite[:, None], cloud.points, 0.0)
-    normals = safe_normalize(jnp.where(finite[:, None], cloud.normals, 0.0))
-    q = grid.index_of(points)
-    within = ((q >= 0.5) & (q <= jnp.asarray(grid.shape) - 1.5)).all(-1)
-    directed = (normals != 0).any(-1)
-    real = cloud.mask & finite & within & directed
-    # Ignored samples go to the middle of the box, with weight 0.
-    middle = (jnp.asarray(grid.shape, q.dtype) - 1) / 2
-    q = jnp.where(real[:, None], q, middle)
-    bad = lambda good: jnp.any(cloud.mask & ~good)
-    result = first_failure(
-        failure_where(jnp.sum(real) < _FEWEST_POINTS, RESULTS.too_few_points),
-        failure_where(bad(finite), RESULTS.nonfinite_input),
-        failure_where(bad(directed | ~finite), RESULTS.zero_normals),
-        failure_where(bad(within), RESULTS.outside_grid),
-    )
-    normals = jnp.where(real[:, None], normals, 0.0)
-    return _Samples(q, normals, real, result, jnp.sum(cloud.mask & ~real))
 
 
 def _screening_for(noise):

@@ -21,9 +21,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._core import first_failure, safe_divide, stage
+from .._core import stage
 from ..linear import (
-    LinearSolution,
     Multigrid,
     conjugate_gradients,
     interpolate,
@@ -33,10 +32,9 @@ from ..linear import (
     restrict,
     splat,
 )
-from ._density import at_level, sample_geometry
-from ._divergence import levels_for
-from ._poisson import prepared_samples
-from ._solution import FieldSolution, PoissonStats
+from ._density import at_level
+from ._measured import Measured
+from ._solution import FieldSolution
 
 _COARSEST = 16
 _COARSE_RTOL = 1e-3
@@ -63,50 +61,27 @@ class SSD(eqx.Module):
 
         Arguments and statuses as `screened_poisson`.
         """
-        levels = self.levels
-        if levels is None:
-            levels = levels_for(cloud.points.shape[0], grid.shape)
-        samples = prepared_samples(cloud, grid)
-        unit = jnp.prod(grid.spacing) ** (1 / 3)
-        found = sample_geometry(
-            samples.q,
-            samples.normals,
-            samples.real,
-            grid.shape,
-            levels=levels,
-            token=token,
+        seen = Measured.of(cloud, grid, weights, self.levels, token)
+        weigh = lambda w: jnp.asarray(w, seen.strength.dtype)
+        system = _System(
+            seen.q,
+            seen.strength,
+            weigh(self.value),
+            weigh(self.gradient),
+            weigh(self.bending),
+            seen.unit / grid.spacing,
+            token,
         )
-        strength = found.area if weights is None else found.area * weights
-        terms = [jnp.asarray(w, strength.dtype) for w in self._weights()]
-        system = _System(samples.q, strength, *terms, unit / grid.spacing, token)
-        solution = self._solved(system, samples.normals, grid.shape)
-        values = solution.value * unit
-        at_samples = interpolate(values, samples.q)
-        level = safe_divide(jnp.sum(strength * at_samples), jnp.sum(strength))
-        stats = PoissonStats(
-            solution.residual,
-            solution.steps,
-            terms[0],
-            found.noise * unit,
-            found.area * unit**2,
-            samples.num_ignored,
-        )
-        result = first_failure(samples.result, solution.result)
-        density = found.density / unit**2
-        return FieldSolution(grid, values, level, density, result, stats)
-
-    def _weights(self):
-        return self.value, self.gradient, self.bending
-
-    def _solved(self, system, normals, shape) -> LinearSolution:
-        return conjugate_gradients(
+        solution = conjugate_gradients(
             system,
-            system.side(normals, shape),
+            system.side(seen.normals, grid.shape),
             rtol=self.rtol,
             max_steps=self.max_steps,
-            preconditioner=system.preconditioner(shape),
+            preconditioner=system.preconditioner(grid.shape),
             start=lambda b: _coarse_to_fine(b, system),
         )
+        in_units = eqx.tree_at(lambda s: s.value, solution, solution.value * seen.unit)
+        return seen.answer(in_units, system.value)
 
 
 class _System(eqx.Module):

@@ -29,7 +29,7 @@ from .._core import RESULTS, GeometryError, first_failure, message, safe_divide
 from ..linear import conjugate_gradients, interpolate, splat
 from ..shapes import Grid, PointCloud
 from ._kernels import AbstractKernel, Matern, Spectrum
-from ._poisson import prepared_samples
+from ._measured import usable_samples
 
 _POINTS_TOGETHER, _SAMPLES_TOGETHER = 8, 4
 _SPACINGS = 3.0
@@ -62,7 +62,7 @@ class StochasticPoisson(eqx.Module):
                     "Call jaxgeom.normals.estimate and orient_consistently first.",
                 )
             )
-        samples = prepared_samples(cloud, grid)
+        samples = usable_samples(cloud, grid)
         kernel = self.kernel
         if kernel is None:
             kernel = Matern(_SPACINGS * jnp.max(grid.spacing))

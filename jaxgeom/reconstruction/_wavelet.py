@@ -22,12 +22,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._core import safe_divide, stage
-from ..linear import interpolate, smooth
-from ._density import sample_geometry
-from ._divergence import levels_for
-from ._poisson import prepared_samples
-from ._solution import FieldSolution, PoissonStats
+from .._core import stage
+from ..linear import smooth
+from ._measured import Measured, without_steps
+from ._solution import FieldSolution
 
 # Which axes a wavelet alternates along; none for the mean.
 _KINDS = tuple(itertools.product((0, 1), repeat=3))
@@ -51,27 +49,13 @@ class Wavelet(eqx.Module):
         Arguments as `screened_poisson`. **Statuses:** `too_few_points`,
         `zero_normals`, `outside_grid` (samples ignored), `nonfinite_input`.
         """
-        shape, levels = grid.shape, self.levels
-        if levels is None:
-            levels = levels_for(cloud.points.shape[0], shape)
-        samples = prepared_samples(cloud, grid)
-        unit = jnp.prod(grid.spacing) ** (1 / 3)
-        found = sample_geometry(
-            samples.q, samples.normals, samples.real, shape, levels=levels, token=token
-        )
-        strength = found.area if weights is None else found.area * weights
+        seen = Measured.of(cloud, grid, weights, self.levels, token)
         # An area vector in units of the nodes along each axis.
-        vectors = samples.normals * (grid.spacing / unit) * strength[:, None]
-        values = 0.5 - indicator(samples.q, vectors, shape)
+        vectors = seen.normals * (grid.spacing / seen.unit) * seen.strength[:, None]
+        values = 0.5 - indicator(seen.q, vectors, grid.shape)
         for _ in range(self.smoothing):
             values = stage(token, smooth, values)
-        at_samples = interpolate(values, samples.q)
-        level = safe_divide(jnp.sum(strength * at_samples), jnp.sum(strength))
-        zero = jnp.zeros((), values.dtype)
-        noise, area = found.noise * unit, found.area * unit**2
-        stats = PoissonStats(zero, jnp.int32(0), zero, noise, area, samples.num_ignored)
-        density = found.density / unit**2
-        return FieldSolution(grid, values, level, density, samples.result, stats)
+        return seen.answer(without_steps(values), jnp.zeros((), values.dtype))
 
 
 def indicator(

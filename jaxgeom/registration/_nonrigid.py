@@ -14,12 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._core import RESULTS, failure_where, first_failure, safe_divide, safe_normalize
+from .._core import RESULTS, failure_where, first_failure, safe_divide
 from ..linear import iterate
-from ..meshes import face_normals, vertex_normals
-from ..neighbors import build, closest_on_mesh, index_surface, knn
+from ..meshes import vertex_normals
 from ..shapes import PointCloud, TriangleMesh
 from ._deformation import AbstractDeformation, Frames
+from ._matching import across, finder, matched
 from ._stiffness import AsRigidAsPossible, StiffnessSchedule
 
 
@@ -73,14 +73,6 @@ class _LeastSquares(eqx.Module):
         return jnp.ones_like(s)
 
 
-class Matches(eqx.Module):
-    """Closest points [v, 3] with unit normals (zero where unknown), where `mask`."""
-
-    points: Float[Array, "v 3"]
-    normals: Float[Array, "v 3"]
-    mask: Bool[Array, " v"]
-
-
 def nonrigid(
     template: TriangleMesh,
     target: PointCloud | TriangleMesh,
@@ -125,7 +117,7 @@ def nonrigid(
     mesh = eqx.tree_at(lambda m: m.vertices, template, inside(template.vertices))
     wash = jnp.where(mesh.vertex_mask[:, None], mesh.vertices, 0)
     mesh = eqx.tree_at(lambda m: m.vertices, mesh, wash)
-    find, ready = _finder(jax.tree.map(jnp.asarray, target), inside)
+    find, ready = finder(jax.tree.map(jnp.asarray, target), inside)
     if landmarks is not None:
         moved = inside(jnp.asarray(landmarks.points, mesh.vertices.dtype))
         landmarks = Landmarks(jnp.asarray(landmarks.vertices), moved, landmarks.weight)
@@ -185,7 +177,7 @@ def _anneal(problem: _Problem, find) -> _Outcome:
 
     def look(frames):
         vertices = model.vertices(prepared, frames)
-        return vertices, _match(problem, find, vertices)
+        return vertices, matched(problem.mesh, conditions, find, vertices)
 
     def step(state):
         before, matches = look(state.frames)
@@ -264,18 +256,6 @@ def _gauss_newton(problem, prepared, frames, matches, stiffness, width):
     return model.move(prepared, frames, solution.value), width
 
 
-def across(vertices, matches: Matches, tangential) -> Float[Array, "v 3"]:
-    """The gap to the closest point, of its part along the surface only a share.
-
-    D gap with D = n n^T + sqrt(tangential) (I - n n^T); all of it without a normal.
-    """
-    gap = vertices - matches.points
-    height = jnp.sum(matches.normals * gap, axis=-1, keepdims=True) * matches.normals
-    known = jnp.any(matches.normals != 0, axis=-1, keepdims=True)
-    share = jnp.where(known, jnp.sqrt(jnp.asarray(tangential, gap.dtype)), 1)
-    return height + share * (gap - height)
-
-
 def landmark_rows(landmarks: Landmarks | None, vertices) -> Float[Array, "l 3"]:
     """Rows whose sum of squares is the weighted mean squared distance."""
     if landmarks is None:
@@ -283,55 +263,6 @@ def landmark_rows(landmarks: Landmarks | None, vertices) -> Float[Array, "l 3"]:
     number = landmarks.points.shape[0]
     scale = jnp.sqrt(jnp.asarray(landmarks.weight, vertices.dtype) / number)
     return scale * (vertices[landmarks.vertices] - landmarks.points)
-
-
-def _match(problem, find, vertices) -> Matches:
-    """Closest points, without those that are too far or whose normals disagree."""
-    mesh, conditions = problem.mesh, problem.conditions
-    found = find(vertices)
-    gap = jnp.sum((vertices - found.points) ** 2, axis=-1)
-    moved = TriangleMesh(
-        vertices,
-        mesh.faces,
-        num_vertices=mesh.num_vertices,
-        num_faces=mesh.num_faces,
-    )
-    cosine = jnp.sum(vertex_normals(moved) * found.normals, axis=-1)
-    unknown = jnp.all(found.normals == 0, axis=-1)
-    agrees = unknown | (cosine >= conditions.least_cosine)
-    near = gap <= conditions.max_distance**2
-    # Correspondences are discrete: the step moves vertices, not what they match.
-    return jax.lax.stop_gradient(
-        Matches(
-            found.points, found.normals, found.mask & mesh.vertex_mask & near & agrees
-        )
-    )
-
-
-def _finder(target, inside):
-    """vertices -> closest points of the target, prepared once; and its status."""
-    if isinstance(target, TriangleMesh):
-        target = eqx.tree_at(lambda m: m.vertices, target, inside(target.vertices))
-        index, normals = index_surface(target), face_normals(target)
-
-        def on_mesh(vertices):
-            near = closest_on_mesh(index, vertices)
-            toward = normals.at[near.faces].get(mode="fill", fill_value=0)
-            return Matches(near.points, toward, near.mask)
-
-        return on_mesh, failure_where(~jnp.any(target.face_mask), RESULTS.no_surface)
-    cloud = target.washed()
-    points = inside(cloud.points)
-    given = jnp.zeros_like(points) if cloud.normals is None else cloud.normals
-    index, normals = build(points, cloud.mask), safe_normalize(given)
-
-    def on_cloud(vertices):
-        near = knn(index, vertices, 1)
-        row, mask = near.indices[:, 0], near.mask[:, 0]
-        take = lambda x: x.at[row].get(mode="fill", fill_value=0)
-        return Matches(take(points), take(normals), mask)
-
-    return on_cloud, failure_where(~jnp.any(cloud.mask), RESULTS.too_few_points)
 
 
 def _half_diagonal(mesh: TriangleMesh):

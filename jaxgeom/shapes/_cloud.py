@@ -47,6 +47,10 @@ class PointCloud(eqx.Module):
         """The number of real points."""
         return self.mask.sum()
 
+    def with_normals(self, normals: Float[Array, "n 3"] | None) -> "PointCloud":
+        """The cloud with other normals."""
+        return PointCloud(self.points, normals, self.mask, self.attributes)
+
     def washed(self) -> "PointCloud":
         """The cloud with zeros in the padding: finite, and without gradient there."""
         wash = lambda x: jnp.where(_expand(self.mask, x.ndim), x, _zero(x))

@@ -127,14 +127,18 @@ def test_shards_are_a_partition_and_come_from_array_jobs():
     assert sorted(sum(held, [])) == sorted(names)
     assert all(20 < len(part) < 70 for part in held)
     assert shard_of("2/5") == Shard(2, 5)
-    slurm = {"SLURM_ARRAY_TASK_ID": "14", "SLURM_ARRAY_TASK_COUNT": "4"}
-    slurm |= {"SLURM_ARRAY_TASK_MIN": "10", "SLURM_ARRAY_TASK_STEP": "2"}
+    slurm = {"SLURM_ARRAY_TASK_ID": "3", "SLURM_ARRAY_TASK_COUNT": "4"}
+    slurm |= {"SLURM_ARRAY_TASK_MIN": "1", "SLURM_ARRAY_TASK_MAX": "4"}
     assert shard_of_environment(slurm) == Shard(2, 4)
     pod = {"JOB_COMPLETION_INDEX": "3"}
     assert shard_of_environment({**pod, "JOB_COMPLETIONS": "9"}) == Shard(3, 9)
     assert shard_of_environment({}) == Shard(0, 1)
     with pytest.raises(GeometryError, match="without JOB_COMPLETIONS"):
         shard_of_environment(pod)
+    for part in ({"MIN": "3", "MAX": "3", "COUNT": "1"}, {"MAX": "7", "COUNT": "3"}):
+        some = slurm | {f"SLURM_ARRAY_TASK_{k}": v for k, v in part.items()}
+        with pytest.raises(GeometryError, match="Pass --shard"):
+            shard_of_environment(some)
     for text in ("5/5", "1", "a/b", "-1/3"):
         with pytest.raises(GeometryError, match="must be i/n"):
             shard_of(text)

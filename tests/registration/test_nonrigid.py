@@ -18,7 +18,8 @@ from jaxgeom.registration import (
     StiffnessSchedule,
     nonrigid,
 )
-from jaxgeom.registration._nonrigid import Matches, across, landmark_rows
+from jaxgeom.registration._matching import Matches, across
+from jaxgeom.registration._nonrigid import landmark_rows
 from jaxgeom.shapes import PointCloud, TriangleMesh
 from jaxgeom.transforms import rotation_exp
 
