@@ -27,6 +27,7 @@ def models():
 
 def main(folder):
     """Make the lessons, train both networks, save them."""
+    folder.mkdir(parents=True, exist_ok=True)
     began = time.time()
     samples, clouds = figures.lessons(SHAPES, SAMPLES, seed=100)
     print(f"{SHAPES} shapes with {SAMPLES} distances each: {time.time() - began:.0f} s")

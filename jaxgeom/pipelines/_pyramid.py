@@ -7,16 +7,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._core import RESULTS, bucket, failure_where, first_failure
 from ..clouds import thin
 from ..normals import estimate
 from ..registration import (
     Method,
+    PreparedTarget,
     Registration,
     Symmetric,
     icp,
+    prepare_target,
 )
 from ..shapes import PointCloud
 
@@ -66,16 +68,63 @@ def align(
     Both clouds have the same size; `rooms` is the capacity of every level, or None.
     """
     pair = jax.tree.map(lambda a, b: jnp.stack([a, b]), source, target)
+
+    def level(room, side, _):
+        # Both clouds in one loop: the program of a level is compiled once.
+        make = partial(make_level, side=side, room=room, neighbors=pyramid.neighbors)
+        small, need = jax.lax.map(make, pair)
+        pick = lambda j: jax.tree.map(lambda x: x[j], small)
+        return pick(0), pick(1), jnp.max(need)
+
+    return _descend(level, voxel_size, init, rooms, pyramid)
+
+
+class TargetLevel(eqx.Module):
+    """A level of a target that many scans share, and how many points it needs."""
+
+    target: PreparedTarget
+    need: Int[Array, ""]
+
+
+def target_levels(
+    target: PointCloud, voxel_size, rooms: tuple[int | None, ...], pyramid: Pyramid
+) -> tuple[TargetLevel, ...]:
+    """The levels of a target with their search structures, coarse first."""
+    out = []
+    for room, share in zip(rooms, pyramid.voxels, strict=True):
+        small, need = make_level(target, share * voxel_size, room, pyramid.neighbors)
+        prepared = prepare_target(small, pyramid.method.correspondence)
+        out.append(TargetLevel(prepared, need))
+    return tuple(out)
+
+
+def align_to(
+    source: PointCloud,
+    levels: tuple[TargetLevel, ...],
+    voxel_size: Float[Array, ""],
+    init,
+    rooms: tuple[int | None, ...],
+    pyramid: Pyramid,
+) -> Registration:
+    """As `align`, on the levels of a target that were made before."""
+
+    def level(room, side, there):
+        small, need = make_level(source, side, room, pyramid.neighbors)
+        return small, there.target, jnp.maximum(need, there.need)
+
+    return _descend(level, voxel_size, init, rooms, pyramid, levels)
+
+
+def _descend(make, voxel_size, init, rooms, pyramid, levels=None) -> Registration:
+    """Down the levels; `make(room, side, level)` gives source, target and need."""
     steps, overflow = jnp.zeros((), jnp.int32), jnp.asarray(False)
     for i, room in enumerate(rooms):
         side = _after(pyramid.voxels[i] * voxel_size, steps)
-        # Both clouds in one loop: the program of a level is compiled once.
-        level = partial(make_level, side=side, room=room, neighbors=pyramid.neighbors)
-        small, need = jax.lax.map(level, pair)
+        source, target, need = make(room, side, None if levels is None else levels[i])
         if room is not None:
-            overflow = overflow | jnp.any(need > room)
+            overflow = overflow | (need > room)
         found = icp(
-            *(jax.tree.map(lambda x, j=j: x[j], small) for j in (0, 1)),
+            *(source, target),
             init=init,
             method=pyramid.method,
             max_distance=pyramid.gates[i] * voxel_size,

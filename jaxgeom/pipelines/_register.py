@@ -15,8 +15,10 @@ from ..transforms import Affine, Rigid, Similarity
 from ._pyramid import (
     Pyramid,
     align,
+    align_to,
     choose_voxel_size,
     level_rooms,
+    target_levels,
     without_sparse_levels,
 )
 
@@ -131,8 +133,9 @@ def register_many(
     pyramid = Pyramid() if pyramid is None else pyramid
     _check_batches(sources, target)
     b = sources.points.shape[0]
-    if target.points.ndim == 2:
-        target = jax.tree.map(lambda x: np.broadcast_to(x, (b, *x.shape)), target)
+    shared = target.points.ndim == 2
+    if shared:
+        target = jax.tree.map(lambda x: np.asarray(x)[None], target)
     batches = [_masked(cloud) for cloud in (sources, target)]
     rows = [points[mask] for points, mask in _rows(batches)]
     some = [points for points in rows if len(points)]
@@ -143,13 +146,18 @@ def register_many(
         pyramid = without_sparse_levels(some, voxel_size, pyramid)
         rooms = level_rooms(some, voxel_size, pyramid)
     center = np.stack([_mean(points) for points in rows[b:]])
+    center = np.broadcast_to(center, (b, 3))
     start = _identities(b) if init is None else _as(init, np.float64)
     start = _conjugated(start, center)
     sources, targets = _same_size(batches, center)
     dtype = sources.points.dtype
-    items = (sources, targets, _as(start, dtype))
     size = jnp.asarray(voxel_size, dtype)
-    found = _run_divided(items, size, rooms, pyramid, chunk)
+    common = None
+    if shared:
+        common = _target_levels(targets, size, rooms, pyramid)
+        targets = None
+    items = (sources, targets, _as(start, dtype))
+    found = _run_divided(items, common, size, rooms, pyramid, chunk)
     moved = _conjugated(_as(found.target_from_source, np.float64), -center)
     return eqx.tree_at(lambda r: r.target_from_source, found, moved)
 
@@ -171,30 +179,50 @@ def _check_batches(sources, target):
     )
 
 
-def _run_divided(items, voxel_size, rooms, pyramid, chunk):
+@eqx.filter_jit
+def _target_levels(targets, voxel_size, rooms, pyramid):
+    """The levels of the one target of a batch."""
+    one = jax.tree.map(lambda x: x[0], targets)
+    return target_levels(one, voxel_size, rooms, pyramid)
+
+
+def _run_divided(items, common, voxel_size, rooms, pyramid, chunk):
     """All items, divided among the local devices; uneven batches repeat the last."""
     b, num_devices = len(items[0].points), jax.local_device_count()
     if num_devices == 1 or b == 1:
-        return _run_many(*(items, voxel_size, rooms, pyramid, chunk), None)
+        return _run_many(*(items, common, voxel_size, rooms, pyramid, chunk), None)
     rows = np.minimum(np.arange(-(-b // num_devices) * num_devices), b - 1)
     mesh = Mesh(np.asarray(jax.local_devices()), ("scan",))
     place = lambda x: jax.device_put(
         np.asarray(x)[rows], NamedSharding(mesh, P("scan"))
     )
     items = jax.tree.map(place, items)
-    found = _run_many(items, voxel_size, rooms, pyramid, chunk, mesh)
+    found = _run_many(items, common, voxel_size, rooms, pyramid, chunk, mesh)
     return jax.tree.map(lambda x: np.asarray(x)[:b], found)
 
 
 @eqx.filter_jit
-def _run_many(items, voxel_size, rooms, pyramid, chunk, mesh):
-    one = lambda item: align(*item[:2], voxel_size, item[2], rooms, pyramid)
-    run = lambda items: jax.lax.map(one, items, batch_size=chunk)
+def _run_many(items, common, voxel_size, rooms, pyramid, chunk, mesh):
+    rest = (rooms, pyramid)
+    arrays, static = eqx.partition(common, eqx.is_array)
+
+    def run(items, arrays, voxel_size):
+        common = eqx.combine(arrays, static)
+
+        def one(item):
+            source, target, start = item
+            if target is None:
+                return align_to(source, common, voxel_size, start, *rest)
+            return align(source, target, voxel_size, start, *rest)
+
+        return jax.lax.map(one, items, batch_size=chunk)
+
     if mesh is None:
-        return run(items)
+        return run(items, arrays, voxel_size)
     # Each device loops over its own scans: a loop over a divided axis would not.
-    spread = {"in_specs": P("scan"), "out_specs": P("scan"), "check_vma": False}
-    return jax.shard_map(run, mesh=mesh, **spread)(items)
+    spread = {"in_specs": (P("scan"), P(), P()), "out_specs": P("scan")}
+    run = jax.shard_map(run, mesh=mesh, check_vma=False, **spread)
+    return run(items, arrays, voxel_size)
 
 
 def _checked(cloud, name) -> PointCloud:
@@ -297,7 +325,8 @@ def _same_size(batches, center):
         wash = lambda x, mask=mask, room=room: jnp.asarray(
             np.where(mask[..., None], np.pad(x, [*room, (0, 0)]), 0).astype(dtype)
         )
-        points = wash(np.asarray(cloud.points, np.float64) - center[:, None])
+        offset = center[: len(cloud.points), None]
+        points = wash(np.asarray(cloud.points, np.float64) - offset)
         parts = (points, wash(cloud.normals) if normals else None, jnp.asarray(mask))
         out.append(eqx.tree_at(where, cloud, parts, is_leaf=lambda x: x is None))
     return out
