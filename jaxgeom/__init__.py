@@ -52,6 +52,7 @@ _NAMES = {
     "Reconstruction": "pipelines",
     "reconstruct": "pipelines",
     "reconstruct_jit": "pipelines",
+    "reconstruct_many": "pipelines",
     "MeanAligned": "pipelines",
     "Pyramid": "pipelines",
     "Registration": "registration",

@@ -15,6 +15,7 @@ from ._pyramid import without_sparse_levels as without_sparse_levels
 from ._reconstruct import Reconstruction as Reconstruction
 from ._reconstruct import reconstruct as reconstruct
 from ._reconstruct import reconstruct_jit as reconstruct_jit
+from ._reconstruct_many import reconstruct_many as reconstruct_many
 from ._register import MeanAligned as MeanAligned
 from ._register import register as register
 from ._register import register_jit as register_jit

@@ -34,7 +34,7 @@ from ..shapes import Grid, PointCloud, TriangleMesh, stack
 from ._memory import check_memory
 from ._prepare import prepare
 
-_EXTRACTOR = MarchingCubes(placement=Cubic(), ambiguity=AsymptoticDecider())
+EXTRACTOR = MarchingCubes(placement=Cubic(), ambiguity=AsymptoticDecider())
 
 
 class Reconstruction(eqx.Module):
@@ -93,9 +93,9 @@ def reconstruct(
 
     **Statuses:** those of `screened_poisson` and `marching_cubes`.
     """
-    check_memory(_checked(resolution), jnp.zeros(()).dtype.itemsize)
+    check_memory(check_resolution(resolution), jnp.zeros(()).dtype.itemsize)
     method = ScreenedPoisson() if method is None else method
-    extractor = _EXTRACTOR if extractor is None else extractor
+    extractor = EXTRACTOR if extractor is None else extractor
     ready = prepare(cloud, weights=weights, orientation=orientation)
     unit, confidence, token = *_padded(ready), runtime_token()
     field = _solve(unit, confidence, method, resolution, padding, token)
@@ -114,7 +114,7 @@ def reconstruct(
         mesh = _clean(mesh, field.stats.area, *cleaning)
         check = _topology(mesh)
     notes = ready.notes + _notes_on(field)
-    mesh, field = _to_user(mesh.trim(), field, ready)
+    mesh, field = to_user(mesh.trim(), field, ready)
     result = first_failure(field.result, status)
     return Reconstruction(mesh, field, result, field.stats, check, notes)
 
@@ -154,17 +154,18 @@ def reconstruct_jit(
             )
         )
     method = ScreenedPoisson() if method is None else method
-    extractor = _EXTRACTOR if extractor is None else extractor
+    extractor = EXTRACTOR if extractor is None else extractor
     grid = Grid.around(cloud, resolution=resolution, padding=padding)
     capacity = Capacity.for_surface(grid.shape) if capacity is None else capacity
     field = method(cloud, grid, weights=weights, token=token)
     found = extractor(field.values, grid, field.level, capacity=capacity, token=token)
-    mesh = _with_attributes(found.mesh, field, cloud, token)
+    mesh = with_attributes(found.mesh, field, cloud, token)
     result = first_failure(field.result, found.result)
     return Reconstruction(mesh, field, result, field.stats)
 
 
-def _checked(resolution):
+def check_resolution(resolution) -> int:
+    """The resolution; `GeometryError` unless it is a whole number of at least 8."""
     if int(resolution) != resolution or resolution < 8:
         raise GeometryError(
             message(
@@ -209,7 +210,7 @@ def _measure(extractor, values, level):
 def _mesh(field, samples, cloud, extractor, capacity, token):
     values, grid = samples
     found = extractor(values, grid, field.level, capacity=capacity, token=token)
-    return _with_attributes(found.mesh, field, cloud, token), found.result
+    return with_attributes(found.mesh, field, cloud, token), found.result
 
 
 @eqx.filter_jit
@@ -224,7 +225,7 @@ def _clean(mesh, areas, trim, min_component):
 _topology = eqx.filter_jit(topology)
 
 
-def _with_attributes(mesh, field, cloud, token):
+def with_attributes(mesh, field, cloud, token):
     """The density of samples and the cloud's attributes, read at the vertices."""
     q = field.grid.index_of(mesh.vertices)
     attributes = {"density": field.density_at(mesh.vertices)}
@@ -257,7 +258,7 @@ def _notes_on(field):
     return ()
 
 
-def _to_user(mesh, field, ready):
+def to_user(mesh, field, ready):
     """Back to the unit and the place of the user, in double precision on the host."""
     scale, dtype = ready.scale, ready.dtype
     back = lambda x: np.asarray(x, np.float64) * scale + ready.center

@@ -4,14 +4,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding
-from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float
 
 from .._core import RESULTS, GeometryError, bucket, message
 from ..registration import Registration
 from ..shapes import PointCloud
 from ..transforms import Affine, Rigid, Similarity
+from ._devices import gathered, on_each, placed
 from ._pyramid import (
     Pyramid,
     align,
@@ -156,8 +155,9 @@ def register_many(
     if shared:
         common = _target_levels(targets, size, rooms, pyramid)
         targets = None
-    items = (sources, targets, _as(start, dtype))
-    found = _run_divided(items, common, size, rooms, pyramid, chunk)
+    items, mesh = placed((sources, targets, _as(start, dtype)))
+    found = _run_many(items, common, size, rooms, pyramid, chunk, mesh)
+    found = found if mesh is None else gathered(found, b)
     moved = _conjugated(_as(found.target_from_source, np.float64), -center)
     return eqx.tree_at(lambda r: r.target_from_source, found, moved)
 
@@ -186,43 +186,22 @@ def _target_levels(targets, voxel_size, rooms, pyramid):
     return target_levels(one, voxel_size, rooms, pyramid)
 
 
-def _run_divided(items, common, voxel_size, rooms, pyramid, chunk):
-    """All items, divided among the local devices; uneven batches repeat the last."""
-    b, num_devices = len(items[0].points), jax.local_device_count()
-    if num_devices == 1 or b == 1:
-        return _run_many(*(items, common, voxel_size, rooms, pyramid, chunk), None)
-    rows = np.minimum(np.arange(-(-b // num_devices) * num_devices), b - 1)
-    mesh = Mesh(np.asarray(jax.local_devices()), ("scan",))
-    place = lambda x: jax.device_put(
-        np.asarray(x)[rows], NamedSharding(mesh, P("scan"))
-    )
-    items = jax.tree.map(place, items)
-    found = _run_many(items, common, voxel_size, rooms, pyramid, chunk, mesh)
-    return jax.tree.map(lambda x: np.asarray(x)[:b], found)
-
-
 @eqx.filter_jit
 def _run_many(items, common, voxel_size, rooms, pyramid, chunk, mesh):
-    rest = (rooms, pyramid)
     arrays, static = eqx.partition(common, eqx.is_array)
 
-    def run(items, arrays, voxel_size):
-        common = eqx.combine(arrays, static)
+    def run(items, given):
+        common, voxel_size = eqx.combine(given[0], static), given[1]
 
         def one(item):
             source, target, start = item
             if target is None:
-                return align_to(source, common, voxel_size, start, *rest)
-            return align(source, target, voxel_size, start, *rest)
+                return align_to(source, common, voxel_size, start, rooms, pyramid)
+            return align(source, target, voxel_size, start, rooms, pyramid)
 
         return jax.lax.map(one, items, batch_size=chunk)
 
-    if mesh is None:
-        return run(items, arrays, voxel_size)
-    # Each device loops over its own scans: a loop over a divided axis would not.
-    spread = {"in_specs": (P("scan"), P(), P()), "out_specs": P("scan")}
-    run = jax.shard_map(run, mesh=mesh, check_vma=False, **spread)
-    return run(items, arrays, voxel_size)
+    return on_each(run, mesh)(items, (arrays, voxel_size))
 
 
 def _checked(cloud, name) -> PointCloud:

@@ -21,4 +21,5 @@ from ._stochastic import StochasticPoisson as StochasticPoisson
 from ._stochastic import probability_hit as probability_hit
 from ._stochastic import stochastic_poisson as stochastic_poisson
 from ._stochastic import view_score as view_score
+from ._support import face_probability as face_probability
 from ._wavelet import Wavelet as Wavelet

@@ -9,15 +9,17 @@ import pytest
 
 from jaxgeom import RESULTS
 from jaxgeom._core import GeometryError
+from jaxgeom.meshes import icosphere, keep_faces
 from jaxgeom.reconstruction import (
     Matern,
     SquaredExponential,
     StochasticPoisson,
+    face_probability,
     probability_hit,
     stochastic_poisson,
     view_score,
 )
-from jaxgeom.shapes import Grid, PointCloud
+from jaxgeom.shapes import Grid, PointCloud, TriangleMesh
 
 SHAPE = (8, 7, 9)
 SETTINGS = dict(noise=0.2, variance=0.4, rtol=1e-10, max_steps=200)
@@ -233,6 +235,53 @@ def test_a_view_of_what_is_unknown_scores_high_and_has_a_slope(x64):
     h = 1e-6
     moved = lambda s: score(unsure, start + s * jnp.array([[0.0, 1.0, 0.0]]))
     np.testing.assert_allclose(slope[0, 1], (moved(h) - moved(-h)) / (2 * h), rtol=1e-4)
+
+
+def test_a_face_is_as_probable_as_planes_near_it():
+    grid = Grid(np.array([-1.0, -2.0, 0.5]), np.array([0.25, 0.5, 0.125]), (9, 9, 17))
+    nodes, rng = np.asarray(grid.nodes()), np.random.default_rng(0)
+    heights = rng.uniform(1.1, 1.9, 40)
+    samples = jnp.asarray(nodes[..., 2] - heights[:, None, None, None])
+    corners = np.array([[-0.4, -0.3, 1.5], [0.5, -0.2, 1.5], [0.1, 0.6, 1.5]])
+    outside = corners + np.array([0.0, 0.0, 0.95])
+    faces = np.array([[0, 1, 2], [3, 4, 5], [6, 6, 6]], np.int32)
+    mesh = TriangleMesh(jnp.asarray(np.concatenate([corners, outside])), faces)
+    for distance in (0.05, 0.2):
+        found = face_probability(mesh, samples, grid, distance=distance)
+        share = np.mean(np.abs(heights - 1.5) < distance)
+        assert 0 < share < 1
+        # The second face reaches out of the grid, the third is padding.
+        np.testing.assert_allclose(found, [share, 0, 0], atol=1e-6)
+    turned = TriangleMesh(mesh.vertices, mesh.faces[:, ::-1])
+    again = jax.jit(face_probability)(turned, samples, grid, distance=0.2)
+    np.testing.assert_array_equal(again, found)
+
+
+def test_trimming_keeps_what_was_scanned():
+    rng = np.random.default_rng(1)
+    normals = rng.standard_normal((400, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals[normals[:, 1] > 0]
+    center, radius = np.array([0.3, -0.2, 0.1]), 0.9
+    cloud = PointCloud(
+        *(jnp.asarray(x, jnp.float32) for x in (center + radius * normals, normals))
+    )
+    grid = Grid(jnp.asarray(center - 2.4), jnp.full(3, 0.2), (24, 24, 24))
+    posterior = jax.jit(stochastic_poisson)(cloud, grid)
+    samples = posterior.samples(jax.random.key(3), 24)
+    ball = icosphere(2, radius=radius)
+    ball = TriangleMesh(ball.vertices + jnp.asarray(center, jnp.float32), ball.faces)
+    height = np.asarray(jnp.mean(ball.triangles(), axis=1))[:, 1] - center[1]
+    near, far = (
+        np.asarray(face_probability(ball, samples, grid, distance=d))
+        for d in (0.1, 0.2)
+    )
+    assert np.mean(far[height > 0.3]) > 0.8 > 0.5 > np.mean(far[height < -0.5])
+    assert np.mean(near) < np.mean(far)
+    kept = keep_faces(ball, jnp.asarray(far >= 0.7)).trim()
+    kept_height = np.asarray(jnp.mean(kept.triangles(), axis=1))[:, 1] - center[1]
+    assert np.sum(kept_height > 0.3) > 0.9 * np.sum(height > 0.3)
+    assert np.sum(kept_height < -0.5) < 0.02 * np.sum(height < -0.5)
 
 
 def test_statuses_and_errors(x64):
