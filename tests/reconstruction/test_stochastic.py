@@ -257,6 +257,7 @@ def test_a_face_is_as_probable_as_planes_near_it():
     np.testing.assert_array_equal(again, found)
 
 
+@pytest.mark.slow
 def test_trimming_keeps_what_was_scanned():
     rng = np.random.default_rng(1)
     normals = rng.standard_normal((400, 3))
