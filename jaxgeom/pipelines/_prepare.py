@@ -130,9 +130,7 @@ def _check_extent(centered, scale, has_normals):
                 "Check the units and the columns of the file.",
             )
         )
-    spread = np.linalg.svd(
-        (centered - centered.mean(axis=0)) / scale, compute_uv=False
-    ) / np.sqrt(len(centered))
+    spread = widths(centered / scale)
     if spread[1] < _FLAT:
         raise GeometryError(
             message(
@@ -154,6 +152,24 @@ def _check_extent(centered, scale, has_normals):
     return ["all points lie in one plane: the surface is a thin sheet; use trim"]
 
 
+def widths(points) -> np.ndarray:
+    """The root mean square extents [3] of points along their main axes, large first."""
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return spread / np.sqrt(len(points))
+
+
+def is_degenerate(points, has_normals: bool) -> bool:
+    """Whether points in a unit box lie on a line, or in a plane without normals."""
+    spread = widths(points)
+    return bool(spread[1] < _FLAT or (spread[2] < _FLAT and not has_normals))
+
+
+def unusable(normals) -> np.ndarray:
+    """Which normals are zero or not finite."""
+    length = np.linalg.norm(np.nan_to_num(normals), axis=-1)
+    return (length == 0) | ~np.isfinite(normals).all(axis=-1)
+
+
 def _with_normals(cloud, orientation):
     if cloud.normals is None:
         padded = jax.tree.map(
@@ -166,8 +182,7 @@ def _with_normals(cloud, orientation):
             None,
             cloud.attributes,
         ), ["normals were estimated and oriented outward"]
-    length = np.linalg.norm(np.nan_to_num(cloud.normals), axis=1)
-    bad = (length == 0) | ~np.isfinite(cloud.normals).all(axis=1)
+    bad = unusable(cloud.normals)
     if bad.mean() > 0.5:
         raise GeometryError(
             message(

@@ -113,7 +113,7 @@ def reconstruct(
         cleaning = jnp.asarray([trim or 0.0, min_component], values.dtype)
         mesh = _clean(mesh, field.stats.area, *cleaning)
         check = _topology(mesh)
-    notes = ready.notes + _notes_on(field)
+    notes = ready.notes + notes_on(field)
     mesh, field = to_user(mesh.trim(), field, ready)
     result = first_failure(field.result, status)
     return Reconstruction(mesh, field, result, field.stats, check, notes)
@@ -250,7 +250,8 @@ def _raise_without_surface(needed):
         )
 
 
-def _notes_on(field):
+def notes_on(field) -> tuple[str, ...]:
+    """What looks odd about a field, in words (host)."""
     corners = np.asarray(field.values)[:: field.values.shape[0] - 1]
     corners = corners[:, :: corners.shape[1] - 1, :: corners.shape[2] - 1]
     if corners.mean() < float(field.level):

@@ -19,10 +19,12 @@ from ..normals import LocalPlanes
 from ..reconstruction import ScreenedPoisson
 from ..shapes import Grid, PointCloud
 from ._devices import gathered, on_each, placed
+from ._prepare import is_degenerate, unusable
 from ._reconstruct import (
     EXTRACTOR,
     Reconstruction,
     check_resolution,
+    notes_on,
     to_user,
     with_attributes,
 )
@@ -31,11 +33,16 @@ _FEWEST = 4
 
 
 class _Way(eqx.Module):
-    """x_user = scale * x + center of one scan (float64, host), and its dtype."""
+    """x_user = scale * x + center of one scan (float64, host), and its dtype.
+
+    `status` is what is wrong with the scan; a hopeless one has no mesh.
+    """
 
     center: np.ndarray
     scale: float
     dtype: np.dtype
+    status: RESULTS
+    is_hopeless: bool = False
 
 
 def reconstruct_many(
@@ -61,18 +68,20 @@ def reconstruct_many(
     - `min_component`: remove bodies with fewer than this share of the faces of the
       largest.
 
-    **Statuses:** those of `reconstruct_jit`; `too_few_points` for fewer than 4 points
-    and `degenerate_input` for points that coincide, or where no surface was found. Such
-    a scan has an empty mesh; none is ever raised, and the others are what they would
-    be alone. `topology` is None: see `meshes.topology`. Raises `GeometryError` for
-    clouds that are no batch.
+    **Statuses:** those of `reconstruct_jit`; for what `reconstruct` refuses
+    `too_few_points` (fewer than 4), `degenerate_input` (points that coincide, lie on a
+    line, or without normals in a plane; or no surface was found) and `zero_normals`
+    (most are zero), each with an empty mesh; `zero_normals` with a mesh where some
+    were ignored. None is ever raised, and the others are what they would be alone.
+    `topology` is None: see `meshes.topology`. Raises `GeometryError` for clouds that
+    are no batch.
     """
     _check_batch(clouds)
     resolution = check_resolution(resolution)
     method = ScreenedPoisson() if method is None else method
     extractor = EXTRACTOR if extractor is None else extractor
     orientation = LocalPlanes() if orientation is None else orientation
-    unit, ways, status = _unit_boxes(clouds)
+    unit, ways = _unit_boxes(clouds)
     b, token = len(ways), runtime_token()
     items, mesh = placed(unit)
     settings = (method, orientation, extractor, resolution)
@@ -86,8 +95,8 @@ def reconstruct_many(
     rows = (jax.tree.map(lambda x, i=i: x[i], (fields, meshes, more)) for i in range(b))
     nothing = np.asarray(needed.faces) == 0
     return [
-        _finished(*row, way, s, empty)
-        for row, way, s, empty in zip(rows, ways, status, nothing, strict=True)
+        _finished(*row, way, empty)
+        for row, way, empty in zip(rows, ways, nothing, strict=True)
     ]
 
 
@@ -106,36 +115,35 @@ def _unit_boxes(clouds):
     """Every scan in a box of side one, the ways back, and what is wrong (host)."""
     points = np.asarray(clouds.points, np.float64)
     mask = np.asarray(clouds.mask) & np.isfinite(points).all(axis=-1)
-    normals = clouds.normals
-    if normals is not None:
-        normals = np.asarray(normals)
-        length = np.linalg.norm(np.nan_to_num(normals), axis=-1)
-        mask = mask & np.isfinite(normals).all(axis=-1) & (length > 0)
-        normals = np.where(mask[..., None], normals, 0)
-    ways, status, unit = [], [], np.zeros(points.shape)
+    oriented = clouds.normals is not None
+    normals = np.asarray(clouds.normals) if oriented else None
+    bad = mask & unusable(normals) if oriented else np.zeros(mask.shape, bool)
+    ways, unit = [], np.zeros(points.shape)
     for i, (row, there) in enumerate(zip(points, mask, strict=True)):
-        way, wrong = _way_of(row[there], clouds.points.dtype)
-        mask[i] &= wrong is None
+        way = _way_of(row[there], bad[i][there], oriented, clouds.points.dtype)
+        mask[i] &= ~bad[i] & (not way.is_hopeless)
         unit[i] = np.where(mask[i][:, None], (row - way.center) / way.scale, 0)
         ways.append(way)
-        status.append(wrong)
     dtype = jax.dtypes.canonicalize_dtype(clouds.points.dtype)
-    cast = lambda x: None if x is None else x.astype(dtype)
+    normals = np.where(mask[..., None], normals, 0).astype(dtype) if oriented else None
     where = lambda c: (c.points, c.normals, c.mask, c.attributes)
-    boxed = (cast(unit), cast(normals), mask, {})
-    none = lambda x: x is None
-    return eqx.tree_at(where, clouds, boxed, is_leaf=none), ways, status
+    boxed = (unit.astype(dtype), normals, mask, {})
+    return eqx.tree_at(where, clouds, boxed, is_leaf=lambda x: x is None), ways
 
 
-def _way_of(points, dtype):
-    """The box of the points of a scan, and the status of a hopeless one."""
+def _way_of(points, bad, oriented, dtype):
+    """The box of the points of a scan, and what `prepare` would say of them."""
+    hopeless = lambda status: _Way(np.zeros(3), 1.0, dtype, status, True)
     if len(points) < _FEWEST:
-        return _Way(np.zeros(3), 1.0, dtype), RESULTS.too_few_points
+        return hopeless(RESULTS.too_few_points)
     low, high = points.min(axis=0), points.max(axis=0)
-    scale = float((high - low).max())
-    if scale == 0:
-        return _Way(low, 1.0, dtype), RESULTS.degenerate_input
-    return _Way((low + high) / 2, scale, dtype), None
+    scale, center = float((high - low).max()), (low + high) / 2
+    if scale == 0 or is_degenerate((points - center) / scale, oriented):
+        return hopeless(RESULTS.degenerate_input)
+    if bad.mean() > 0.5:
+        return hopeless(RESULTS.zero_normals)
+    status = RESULTS.zero_normals if bad.any() else RESULTS.successful
+    return _Way(center, scale, dtype, status)
 
 
 @eqx.filter_jit
@@ -179,13 +187,12 @@ def _extract(items, common, extractor, capacity, mesh):
     return on_each(run, mesh)(items, common)
 
 
-def _finished(field, mesh, status, way, wrong, empty) -> Reconstruction:
+def _finished(field, mesh, status, way, empty) -> Reconstruction:
     """One scan back in its unit and place, with its status."""
-    result = first_failure(field.result, status)
-    if wrong is not None:
-        result = wrong
-    else:
+    result = first_failure(way.status, first_failure(field.result, status))
+    if not way.is_hopeless:
         nothing = failure_where(jnp.asarray(empty), RESULTS.degenerate_input)
         result = first_failure(result, nothing)
+    notes = () if way.is_hopeless else notes_on(field)
     mesh, field = to_user(mesh.trim(), field, way)
-    return Reconstruction(mesh, field, result, field.stats)
+    return Reconstruction(mesh, field, result, field.stats, None, notes)

@@ -38,6 +38,13 @@ def _batch():
     ]
 
 
+def _many(scans):
+    """With the extractor that compiles fastest."""
+    return reconstruct_many(
+        stack(scans), resolution=RESOLUTION, extractor=MarchingCubes()
+    )
+
+
 def _float(cloud):
     return PointCloud(
         *(np.asarray(x, np.float32) for x in (cloud.points, cloud.normals))
@@ -53,6 +60,7 @@ def test_each_is_as_alone():
         there = np.isfinite(scan.points).all(axis=1)
         clean = PointCloud(scan.points[there], scan.normals[there])
         alone = reconstruct(clean, resolution=RESOLUTION)
+        assert found[i].result == alone.result
         np.testing.assert_array_equal(found[i].mesh.faces, alone.mesh.faces)
         size = np.ptp(clean.points)
         vertices = found[i].mesh.vertices
@@ -61,10 +69,7 @@ def test_each_is_as_alone():
 
 def test_bad_scans_spoil_nothing_and_order_does_not_matter():
     scans = [_float(scan) for scan in _batch()]
-    many = lambda scans: reconstruct_many(
-        stack(scans), resolution=RESOLUTION, extractor=MarchingCubes()
-    )
-    forth, back = many(scans), many(scans[::-1])[::-1]
+    forth, back = _many(scans), _many(scans[::-1])[::-1]
     wrong = {1: RESULTS.too_few_points, 3: RESULTS.degenerate_input}
     for i, (one, other) in enumerate(zip(forth, back, strict=True)):
         assert one.result == wrong.get(i, RESULTS.successful), i
@@ -83,6 +88,38 @@ def test_bad_scans_spoil_nothing_and_order_does_not_matter():
             pairs = set(map(tuple, edges))
             assert len(pairs) == len(edges)
             assert pairs == {(j, i) for i, j in pairs}
+
+
+def test_what_is_refused_alone_has_a_status_here():
+    good = _float(_scan(300, 1))
+    line = np.linspace(0.1, 2.0, 300)[:, None] * np.array([1.0, 0.3, -0.5])
+    few, most = (np.array(good.normals) for _ in range(2))
+    few[:20], most[:200] = 0, 0
+    scans = [
+        _float(PointCloud(line, np.asarray(good.normals))),
+        PointCloud(good.points, most),
+        PointCloud(good.points, few),
+        PointCloud(good.points, -np.asarray(good.normals)),
+        good,
+    ]
+    found = _many(scans)
+    names = ["degenerate_input", "zero_normals", "zero_normals", *["successful"] * 2]
+    for i, (item, name) in enumerate(zip(found, names, strict=True)):
+        assert item.result == getattr(RESULTS, name), i
+        assert (len(item.mesh.faces) == 0) == (i < 2)
+        if i < 2:
+            with pytest.raises(GeometryError):
+                reconstruct(scans[i], resolution=RESOLUTION)
+    assert "inverted" in found[3].notes[0] and found[4].notes == ()
+
+
+@pytest.mark.slow
+def test_a_plane_without_normals_has_no_inside():
+    bare = PointCloud(np.asarray(_scan(300, 1).points, np.float32))
+    flat = PointCloud(bare.points * np.array([1, 1, 0], np.float32))
+    one, other = _many([flat, bare])
+    assert one.result == RESULTS.degenerate_input and len(one.mesh.faces) == 0
+    assert other.result == RESULTS.successful and len(other.mesh.faces) > 0
 
 
 def test_one_cloud_is_no_batch():
