@@ -20,9 +20,10 @@ def face_probability(
 
     The event: along the normal n through the centroid c, the field has unlike signs at
     c - d n and c + d n. What comes out is the share of the sampled fields in which it
-    has: with s samples its error is at most 1 / (2 sqrt(s)). A piecewise constant
-    number, so its gradient is zero. Padding, and faces whose segment leaves the grid,
-    have probability 0.
+    has: with s samples its deviation is at most 1 / (2 sqrt(s)). A surface that crosses
+    the segment twice, such as both sides of a thin wall, is not counted.
+    A piecewise constant number, so its gradient is zero. Padding, and faces whose
+    segment leaves the grid, have probability 0.
 
     To trim a mesh where a scan does not say where the surface is:
 
