@@ -3,8 +3,11 @@
 import gc
 import os
 import pathlib
+import subprocess
+import sys
 
 import jax
+import numpy as np
 import pytest
 
 _CACHE = os.environ.get("JAXGEOM_TEST_CACHE")
@@ -27,6 +30,21 @@ def x64():
     """Double precision within one test."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def on_devices(tmp_path):
+    """A function that runs code, which must save arrays at sys.argv[1], in a process of
+    its own with a number of CPU devices, and returns the arrays."""
+
+    def run(code, count):
+        flags = f"--xla_force_host_platform_device_count={count}"
+        path = tmp_path / f"{count}.npz"
+        env = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+        subprocess.run([sys.executable, "-c", code, str(path)], check=True, env=env)
+        return np.load(path)
+
+    return run
 
 
 @pytest.fixture(scope="module", autouse=True)

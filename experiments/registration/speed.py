@@ -169,43 +169,60 @@ def table_of(transform):
     return matrix(turn.astype(float), shift.astype(float))
 
 
+def gicp_side(points, threads):
+    """A cloud of small_gicp with normals, and its tree."""
+    cloud = small_gicp.PointCloud(points)
+    tree = small_gicp.KdTree(cloud, num_threads=threads)
+    small_gicp.estimate_normals_covariances(
+        cloud, tree, num_neighbors=NEIGHBORS, num_threads=threads
+    )
+    return cloud, tree
+
+
+def gicp_aligned(source, target_side, start, gate, **settings):
+    """The pose of a cloud on a side of small_gicp."""
+    found = small_gicp.align(
+        *(target_side[0], source, target_side[1], start),
+        max_correspondence_distance=gate,
+        max_iterations=MOST_STEPS,
+        **settings,
+    )
+    return found.T_target_source
+
+
 def by_gicp(kind, threads):
     """A function that aligns a pair by small_gicp."""
+    settings = {"registration_type": kind, "num_threads": threads}
 
     def run(source, target, start, _):
-        there, here = (small_gicp.PointCloud(x) for x in (target, source))
-        trees = [small_gicp.KdTree(x, num_threads=threads) for x in (there, here)]
-        for cloud, tree in zip((there, here), trees, strict=True):
-            small_gicp.estimate_normals_covariances(
-                cloud, tree, num_neighbors=NEIGHBORS, num_threads=threads
-            )
-        found = small_gicp.align(
-            *(there, here, trees[0], start),
-            registration_type=kind,
-            max_correspondence_distance=GATE,
-            num_threads=threads,
-            max_iterations=MOST_STEPS,
-        )
-        return found.T_target_source
+        there, here = (gicp_side(x, threads) for x in (target, source))
+        return gicp_aligned(here[0], there, start, GATE, **settings)
 
     return run
 
 
-def by_open3d(source, target, start, _):
-    """The pose by Open3D, point to plane."""
-    clouds = []
-    for points in (source, target):
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-        near = open3d.geometry.KDTreeSearchParamKNN(NEIGHBORS)
-        cloud.estimate_normals(near)
-        clouds.append(cloud)
+def open3d_side(points, normals=True):
+    """A cloud of Open3D, with normals or without."""
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    if normals:
+        cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBORS))
+    return cloud
+
+
+def open3d_aligned(source, target, start, gate, *kernel):
+    """The pose of clouds of Open3D, point to plane."""
     rules = open3d.pipelines.registration
     found = rules.registration_icp(
-        *(*clouds, GATE, start),
-        rules.TransformationEstimationPointToPlane(),
+        *(source, target, gate, start),
+        rules.TransformationEstimationPointToPlane(*kernel),
         rules.ICPConvergenceCriteria(max_iteration=MOST_STEPS),
     )
     return found.transformation
+
+
+def by_open3d(source, target, start, _):
+    """The pose by Open3D, point to plane."""
+    return open3d_aligned(*map(open3d_side, (source, target)), start, GATE)
 
 
 def peers():

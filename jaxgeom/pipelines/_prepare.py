@@ -5,12 +5,20 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._core import GeometryError, bucket, message
+from .._core import RESULTS, GeometryError, bucket, message
 from ..normals import LocalPlanes
 from ..shapes import PointCloud, stack
 
 _FEWEST = 4
 _FLAT = 1e-6
+
+
+class Refused(GeometryError):
+    """A cloud of which no surface can be made; `status` says so in a batch."""
+
+    def __init__(self, status: RESULTS, text: str):
+        GeometryError.__init__(self, text)
+        self.status = status
 
 
 class Prepared(eqx.Module):
@@ -100,100 +108,95 @@ def _cast(normals, dtype):
 
 
 def check_points(points) -> None:
-    """Raise `GeometryError` for too few points, or points that are not finite."""
+    """Raise `Refused` for too few points, or points that are not finite."""
     if points.shape[0] < _FEWEST:
-        raise GeometryError(
+        raise Refused(
+            RESULTS.too_few_points,
             message(
                 f"a surface needs at least {_FEWEST} points",
                 f"{points.shape[0]}",
                 "Check the file, or the mask of the cloud.",
-            )
+            ),
         )
     bad = ~np.isfinite(points).all(axis=1)
     if bad.any():
-        raise GeometryError(
+        raise Refused(
+            RESULTS.nonfinite_input,
             message(
                 "points must be finite",
                 f"{bad.sum()} of {bad.size} hold NaN or infinity, the first in row "
                 f"{int(np.argmax(bad))}",
                 "Mask them: PointCloud(points, normals, mask).",
-            )
+            ),
         )
 
 
 def _check_extent(centered, scale, has_normals):
     if scale == 0:
-        raise GeometryError(
+        raise Refused(
+            RESULTS.degenerate_input,
             message(
                 "points must not all coincide",
                 f"{len(centered)} equal points",
                 "Check the units and the columns of the file.",
-            )
+            ),
         )
-    spread = widths(centered / scale)
+    spread = np.linalg.svd(
+        (centered - centered.mean(axis=0)) / scale, compute_uv=False
+    ) / np.sqrt(len(centered))
     if spread[1] < _FLAT:
-        raise GeometryError(
+        raise Refused(
+            RESULTS.degenerate_input,
             message(
                 "points must not lie on one line",
                 f"width {spread[1] * scale:.2g} at length {spread[0] * scale:.2g}",
                 "A surface needs points in at least two directions.",
-            )
+            ),
         )
     if spread[2] >= _FLAT:
         return []
     if not has_normals:
-        raise GeometryError(
+        raise Refused(
+            RESULTS.degenerate_input,
             message(
                 "points without normals must not lie in one plane",
                 f"thickness {spread[2] * scale:.2g} at width {spread[1] * scale:.2g}",
                 "Give normals: they say which side is outside.",
-            )
+            ),
         )
     return ["all points lie in one plane: the surface is a thin sheet; use trim"]
 
 
-def widths(points) -> np.ndarray:
-    """The root mean square extents [3] of points along their main axes, large first."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return spread / np.sqrt(len(points))
-
-
-def is_degenerate(points, has_normals: bool) -> bool:
-    """Whether points in a unit box lie on a line, or in a plane without normals."""
-    spread = widths(points)
-    return bool(spread[1] < _FLAT or (spread[2] < _FLAT and not has_normals))
-
-
-def unusable(normals) -> np.ndarray:
-    """Which normals are zero or not finite."""
-    length = np.linalg.norm(np.nan_to_num(normals), axis=-1)
-    return (length == 0) | ~np.isfinite(normals).all(axis=-1)
-
-
 def _with_normals(cloud, orientation):
+    notes = notes_on_normals(cloud)
+    if cloud.normals is not None:
+        return cloud, notes
+    padded = jax.tree.map(
+        lambda x: x[0], stack([cloud], capacity=bucket(cloud.points.shape[0]))
+    )
+    oriented = _orient(orientation, padded)
+    normals = np.asarray(oriented.normals)[: len(cloud.points)]
+    return PointCloud(cloud.points, normals, None, cloud.attributes), notes
+
+
+def notes_on_normals(cloud) -> list[str]:
+    """What is estimated or ignored; `Refused` where most normals cannot be used."""
     if cloud.normals is None:
-        padded = jax.tree.map(
-            lambda x: x[0], stack([cloud], capacity=bucket(cloud.points.shape[0]))
-        )
-        oriented = _orient(orientation, padded)
-        return PointCloud(
-            cloud.points,
-            np.asarray(oriented.normals)[: len(cloud.points)],
-            None,
-            cloud.attributes,
-        ), ["normals were estimated and oriented outward"]
-    bad = unusable(cloud.normals)
+        return ["normals were estimated and oriented outward"]
+    length = np.linalg.norm(np.nan_to_num(cloud.normals), axis=1)
+    bad = (length == 0) | ~np.isfinite(cloud.normals).all(axis=1)
     if bad.mean() > 0.5:
-        raise GeometryError(
+        raise Refused(
+            RESULTS.zero_normals,
             message(
                 "most normals must be finite and not zero",
                 f"{bad.sum()} of {bad.size} are not",
                 "Leave the normals out: they are estimated then.",
-            )
+            ),
         )
     if not bad.any():
-        return cloud, []
-    return cloud, [f"{bad.sum()} of {bad.size} points have no usable normal: ignored"]
+        return []
+    return [f"{bad.sum()} of {bad.size} points have no usable normal: ignored"]
 
 
 @eqx.filter_jit

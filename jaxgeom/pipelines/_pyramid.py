@@ -69,9 +69,10 @@ def align(
     """
     pair = jax.tree.map(lambda a, b: jnp.stack([a, b]), source, target)
 
-    def level(room, side, _):
+    def level(i, side):
         # Both clouds in one loop: the program of a level is compiled once.
-        make = partial(make_level, side=side, room=room, neighbors=pyramid.neighbors)
+        sizes = {"room": rooms[i], "neighbors": pyramid.neighbors}
+        make = partial(make_level, side=side, **sizes)
         small, need = jax.lax.map(make, pair)
         pick = lambda j: jax.tree.map(lambda x: x[j], small)
         return pick(0), pick(1), jnp.max(need)
@@ -108,19 +109,19 @@ def align_to(
 ) -> Registration:
     """As `align`, on the levels of a target that were made before."""
 
-    def level(room, side, there):
-        small, need = make_level(source, side, room, pyramid.neighbors)
-        return small, there.target, jnp.maximum(need, there.need)
+    def level(i, side):
+        small, need = make_level(source, side, rooms[i], pyramid.neighbors)
+        return small, levels[i].target, jnp.maximum(need, levels[i].need)
 
-    return _descend(level, voxel_size, init, rooms, pyramid, levels)
+    return _descend(level, voxel_size, init, rooms, pyramid)
 
 
-def _descend(make, voxel_size, init, rooms, pyramid, levels=None) -> Registration:
-    """Down the levels; `make(room, side, level)` gives source, target and need."""
+def _descend(level, voxel_size, init, rooms, pyramid) -> Registration:
+    """Down the levels; `level(i, side)` gives source, target and the room they need."""
     steps, overflow = jnp.zeros((), jnp.int32), jnp.asarray(False)
     for i, room in enumerate(rooms):
         side = _after(pyramid.voxels[i] * voxel_size, steps)
-        source, target, need = make(room, side, None if levels is None else levels[i])
+        source, target, need = level(i, side)
         if room is not None:
             overflow = overflow | (need > room)
         found = icp(

@@ -1,5 +1,7 @@
 """The meshes of a ragged batch of scans, in two compiled calls."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,6 @@ import numpy as np
 from .._core import (
     RESULTS,
     GeometryError,
-    failure_where,
     first_failure,
     message,
     runtime_token,
@@ -17,9 +18,9 @@ from ..isosurface import Capacity, pad_outside
 from ..meshes import keep_faces, large_components
 from ..normals import LocalPlanes
 from ..reconstruction import ScreenedPoisson
-from ..shapes import Grid, PointCloud
+from ..shapes import Grid, PointCloud, stack
 from ._devices import gathered, on_each, placed
-from ._prepare import is_degenerate, unusable
+from ._prepare import Prepared, Refused, notes_on_normals, unit_box
 from ._reconstruct import (
     EXTRACTOR,
     Reconstruction,
@@ -29,20 +30,12 @@ from ._reconstruct import (
     with_attributes,
 )
 
-_FEWEST = 4
 
+class _Item(eqx.Module):
+    """A scan in its unit box; `refusal` is the status of one that has no surface."""
 
-class _Way(eqx.Module):
-    """x_user = scale * x + center of one scan (float64, host), and its dtype.
-
-    `status` is what is wrong with the scan; a hopeless one has no mesh.
-    """
-
-    center: np.ndarray
-    scale: float
-    dtype: np.dtype
-    status: RESULTS
-    is_hopeless: bool = False
+    ready: Prepared
+    refusal: RESULTS | None
 
 
 def reconstruct_many(
@@ -63,41 +56,37 @@ def reconstruct_many(
 
     **Arguments:** as `reconstruct`, and
 
-    - `clouds`: scans as one batch [b, n, 3] with masks, of `jaxgeom.stack`. Points and
-      normals that are not finite are ignored; attributes are not carried along.
+    - `clouds`: scans as one batch [b, n, 3] with masks, of `jaxgeom.stack`. Points
+      that are not finite are ignored.
     - `min_component`: remove bodies with fewer than this share of the faces of the
       largest.
 
-    **Statuses:** those of `reconstruct_jit`; for what `reconstruct` refuses
+    **Statuses:** those of `reconstruct_jit`, and for what `reconstruct` refuses
     `too_few_points` (fewer than 4), `degenerate_input` (points that coincide, lie on a
-    line, or without normals in a plane; or no surface was found) and `zero_normals`
-    (most are zero), each with an empty mesh; `zero_normals` with a mesh where some
-    were ignored. None is ever raised, and the others are what they would be alone.
-    `topology` is None: see `meshes.topology`. Raises `GeometryError` for clouds that
-    are no batch.
+    line, or without normals in a plane) and `zero_normals` (most are), each with an
+    empty mesh and the text of the error among the `notes`. None is ever raised, and
+    the others are what they would be alone. `topology` is None: see
+    `meshes.topology`. Raises `GeometryError` for clouds that are no batch.
     """
     _check_batch(clouds)
     resolution = check_resolution(resolution)
     method = ScreenedPoisson() if method is None else method
     extractor = EXTRACTOR if extractor is None else extractor
     orientation = LocalPlanes() if orientation is None else orientation
-    unit, ways = _unit_boxes(clouds)
-    b, token = len(ways), runtime_token()
+    scans = [_item(clouds, i) for i in range(clouds.points.shape[0])]
+    unit = stack([scan.ready.cloud for scan in scans], capacity=clouds.points.shape[1])
     items, mesh = placed(unit)
+    dtype = jax.dtypes.canonicalize_dtype(unit.points.dtype)
+    token = runtime_token()
     settings = (method, orientation, extractor, resolution)
-    share = jnp.asarray(padding, unit.points.dtype)
-    fields, needed = _solve(items, (share, token), settings, mesh)
+    fields, needed = _solve(items, (jnp.asarray(padding, dtype), token), settings, mesh)
     most = jax.tree.map(lambda x: int(np.max(np.asarray(x))), needed)
     capacity = Capacity.holding(*jax.tree.leaves(most))
-    least = jnp.asarray(min_component, unit.points.dtype)
-    meshes, more = _extract((items, fields), (least, token), extractor, capacity, mesh)
-    fields, meshes, more, needed = gathered((fields, meshes, more, needed), b)
-    rows = (jax.tree.map(lambda x, i=i: x[i], (fields, meshes, more)) for i in range(b))
-    nothing = np.asarray(needed.faces) == 0
-    return [
-        _finished(*row, way, empty)
-        for row, way, empty in zip(rows, ways, nothing, strict=True)
-    ]
+    least = jnp.asarray(min_component, dtype)
+    found = _extract((items, fields), (least, token), extractor, capacity, mesh)
+    found = gathered((fields, *found), len(scans))
+    rows = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(len(scans)))
+    return [_finished(*row, scan) for row, scan in zip(rows, scans, strict=True)]
 
 
 def _check_batch(clouds):
@@ -111,39 +100,21 @@ def _check_batch(clouds):
         )
 
 
-def _unit_boxes(clouds):
-    """Every scan in a box of side one, the ways back, and what is wrong (host)."""
-    points = np.asarray(clouds.points, np.float64)
-    mask = np.asarray(clouds.mask) & np.isfinite(points).all(axis=-1)
-    oriented = clouds.normals is not None
-    normals = np.asarray(clouds.normals) if oriented else None
-    bad = mask & unusable(normals) if oriented else np.zeros(mask.shape, bool)
-    ways, unit = [], np.zeros(points.shape)
-    for i, (row, there) in enumerate(zip(points, mask, strict=True)):
-        way = _way_of(row[there], bad[i][there], oriented, clouds.points.dtype)
-        mask[i] &= ~bad[i] & (not way.is_hopeless)
-        unit[i] = np.where(mask[i][:, None], (row - way.center) / way.scale, 0)
-        ways.append(way)
-    dtype = jax.dtypes.canonicalize_dtype(clouds.points.dtype)
-    normals = np.where(mask[..., None], normals, 0).astype(dtype) if oriented else None
-    where = lambda c: (c.points, c.normals, c.mask, c.attributes)
-    boxed = (unit.astype(dtype), normals, mask, {})
-    return eqx.tree_at(where, clouds, boxed, is_leaf=lambda x: x is None), ways
-
-
-def _way_of(points, bad, oriented, dtype):
-    """The box of the points of a scan, and what `prepare` would say of them."""
-    hopeless = lambda status: _Way(np.zeros(3), 1.0, dtype, status, True)
-    if len(points) < _FEWEST:
-        return hopeless(RESULTS.too_few_points)
-    low, high = points.min(axis=0), points.max(axis=0)
-    scale, center = float((high - low).max()), (low + high) / 2
-    if scale == 0 or is_degenerate((points - center) / scale, oriented):
-        return hopeless(RESULTS.degenerate_input)
-    if bad.mean() > 0.5:
-        return hopeless(RESULTS.zero_normals)
-    status = RESULTS.zero_normals if bad.any() else RESULTS.successful
-    return _Way(center, scale, dtype, status)
+def _item(clouds, i) -> _Item:
+    """Scan number `i`, as `prepare` takes it, but missing normals stay missing."""
+    cloud = jax.tree.map(lambda x: np.asarray(x[i]), clouds)
+    there = cloud.mask & np.isfinite(cloud.points).all(axis=1)
+    cloud = eqx.tree_at(lambda c: c.mask, cloud, there)
+    try:
+        ready = unit_box(cloud)
+        notes = (*ready.notes, *notes_on_normals(ready.cloud))
+        return _Item(dataclasses.replace(ready, notes=notes), None)
+    except Refused as refused:
+        # The program runs on an empty cloud, and no one looks at what comes out.
+        empty = jax.tree.map(np.zeros_like, cloud)
+        where = (np.zeros(3), 1.0, cloud.points.dtype)
+        ready = Prepared(empty, None, *where, (str(refused),))
+        return _Item(ready, refused.status)
 
 
 @eqx.filter_jit
@@ -178,21 +149,18 @@ def _extract(items, common, extractor, capacity, mesh):
             values, grid = pad_outside(field.values, field.grid, field.level)
             found = extractor(values, grid, field.level, capacity=capacity, token=token)
             shown = with_attributes(found.mesh, field, cloud, token)
-            return keep_faces(
-                shown, large_components(shown, min_fraction=least)
-            ), found.result
+            large = large_components(shown, min_fraction=least)
+            return keep_faces(shown, large), found.result
 
         return jax.lax.map(one, items)
 
     return on_each(run, mesh)(items, common)
 
 
-def _finished(field, mesh, status, way, empty) -> Reconstruction:
+def _finished(field, mesh, status, item) -> Reconstruction:
     """One scan back in its unit and place, with its status."""
-    result = first_failure(way.status, first_failure(field.result, status))
-    if not way.is_hopeless:
-        nothing = failure_where(jnp.asarray(empty), RESULTS.degenerate_input)
-        result = first_failure(result, nothing)
-    notes = () if way.is_hopeless else notes_on(field)
-    mesh, field = to_user(mesh.trim(), field, way)
+    result, notes = item.refusal, item.ready.notes
+    if result is None:
+        result, notes = first_failure(field.result, status), notes + notes_on(field)
+    mesh, field = to_user(mesh.trim(), field, item.ready)
     return Reconstruction(mesh, field, result, field.stats, None, notes)

@@ -301,9 +301,9 @@ def view_score(
     step = length / num_steps
     t = (jnp.arange(num_steps) + 0.5) * step
     points = origins[:, None] + t[:, None] * directions[:, None]
-    q = grid.index_of(points.reshape(-1, 3))
-    within = jnp.all((q >= 0) & (q <= jnp.asarray(grid.shape) - 1), axis=-1)
-    p = jnp.where(within, interpolate(inside, q), 0).reshape(points.shape[:2])
+    q = grid.index_of(points)
+    p = interpolate(inside, q.reshape(-1, 3)).reshape(points.shape[:2])
+    p = jnp.where(grid.holds(points), p, 0)
     passed = jnp.cumprod(1 - p, axis=1)
     before = jnp.concatenate([jnp.ones_like(p[:, :1]), passed[:, :-1]], axis=1)
     return jnp.mean(jnp.sum(before * (0.5 - jnp.abs(p - 0.5)), axis=1)) * step

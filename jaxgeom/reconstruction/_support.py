@@ -23,7 +23,7 @@ def face_probability(
     has: with s samples its deviation is at most 1 / (2 sqrt(s)). A surface that crosses
     the segment twice, such as both sides of a thin wall, is not counted.
     A piecewise constant number, so its gradient is zero. Padding, and faces whose
-    segment leaves the grid, have probability 0.
+    segment leaves the grid, have probability 0; NaN where a sample is NaN.
 
     To trim a mesh where a scan does not say where the surface is:
 
@@ -33,18 +33,18 @@ def face_probability(
     **Arguments:** `samples` of `Posterior.samples` on the nodes of `grid`; `distance`
     in the unit of the mesh.
 
-    Source: the use of Sellan and Jacobson (2022), section 5, face by face.
+    For the distribution see Sellan and Jacobson (2022), as in `stochastic_poisson`.
     """
-    corners = mesh.triangles()
-    center = jnp.mean(corners, axis=1)
+    center = jnp.mean(mesh.triangles(), axis=1)
     step = distance * face_normals(mesh)
-    q = grid.index_of(jnp.concatenate([center - step, center + step]))
-    within = jnp.all((q >= 0) & (q <= jnp.asarray(grid.shape) - 1), axis=-1)
-    within = jnp.all(within.reshape(2, -1), axis=0) & mesh.face_mask
+    ends = jnp.stack([center - step, center + step])
+    within = jnp.all(grid.holds(ends), axis=0) & mesh.face_mask
+    q = grid.index_of(ends.reshape(-1, 3))
 
     def crossed(values):
         inner, outer = interpolate(values, q).reshape(2, -1)
-        return (inner < 0) != (outer < 0)
+        known = jnp.isfinite(inner) & jnp.isfinite(outer)
+        return jnp.where(known, (inner < 0) != (outer < 0), jnp.nan)
 
-    share = jnp.mean(lax.map(crossed, samples), axis=0, dtype=samples.dtype)
+    share = jnp.mean(lax.map(crossed, samples), axis=0).astype(samples.dtype)
     return jnp.where(within, share, 0)

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._core import GeometryError, check_shape, message
 from ._cloud import PointCloud
@@ -69,3 +69,8 @@ class Grid(eqx.Module):
     def index_of(self, points: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
         """The (fractional) node indices of points."""
         return (points - self.origin) / self.spacing
+
+    def holds(self, points: Float[Array, "*n 3"]) -> Bool[Array, "*n"]:
+        """Whether points lie between the first and the last nodes, these included."""
+        q = self.index_of(points)
+        return jnp.all((q >= 0) & (q <= jnp.asarray(self.shape) - 1), axis=-1)

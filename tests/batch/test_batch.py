@@ -218,7 +218,7 @@ def test_a_killed_driver_goes_on_and_two_drivers_agree(work, tmp_path):
 
 
 @pytest.mark.slow
-def test_four_devices_equal_one(tmp_path):
+def test_four_devices_equal_one(on_devices):
     code = f"""
 import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})
 import jax, numpy as np
@@ -231,14 +231,7 @@ assert matrix.shape == (6, 4, 4)
 np.savez(sys.argv[1], n=jax.local_device_count(), matrix=matrix,
          fitness=found.fitness, steps=found.num_steps)
 """
-    results = []
-    for count in (1, 4):
-        flags = f"--xla_force_host_platform_device_count={count}"
-        path = tmp_path / f"{count}.npz"
-        env = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
-        subprocess.run([sys.executable, "-c", code, str(path)], check=True, env=env)
-        results.append(np.load(path))
-    one, four = results
+    one, four = (on_devices(code, count) for count in (1, 4))
     assert one["n"] == 1 and four["n"] == 4
     np.testing.assert_array_equal(one["steps"], four["steps"])
     np.testing.assert_allclose(one["matrix"], four["matrix"], atol=1e-6)

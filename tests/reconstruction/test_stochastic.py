@@ -255,6 +255,11 @@ def test_a_face_is_as_probable_as_planes_near_it():
     turned = TriangleMesh(mesh.vertices, mesh.faces[:, ::-1])
     again = jax.jit(face_probability)(turned, samples, grid, distance=0.2)
     np.testing.assert_array_equal(again, found)
+    both = jax.vmap(lambda d: face_probability(mesh, samples, grid, distance=d))
+    np.testing.assert_array_equal(both(jnp.array([0.05, 0.2]))[1], found)
+    unknown = samples.at[3].set(jnp.nan)
+    found = face_probability(mesh, unknown, grid, distance=0.2)
+    np.testing.assert_array_equal(np.isnan(found), [True, False, False])
 
 
 @pytest.mark.slow
