@@ -17,6 +17,7 @@ far as the run goes on. Run it from the root of the repository.
 import argparse
 import csv
 import json
+import os
 import pathlib
 import resource
 import subprocess
@@ -107,6 +108,8 @@ def told(found, truth):
 
 def ours(folder):
     """One run of the batch; prints its clock and memory as JSON (own process)."""
+    # As `jaxgeom batch` does.
+    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
     start, marks = time.perf_counter(), []
     used = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     tell = lambda text: marks.append((time.perf_counter() - start, text, used()))

@@ -5,13 +5,7 @@ import jax
 import numpy as np
 
 from .._core import RESULTS, bucket
-from ..pipelines import (
-    Pyramid,
-    choose_voxel_size,
-    level_rooms,
-    register_many,
-    without_sparse_levels,
-)
+from ..pipelines import register_many
 from ..registration import Registration
 from ..shapes import PointCloud, stack
 from ..transforms import Rigid
@@ -71,25 +65,20 @@ class Chunks:
         return key, works, target, room
 
 
-def align_chunk(key, works, target, chosen, room, tell) -> list[Registration]:
-    """The alignment of each scan of a chunk, on the host.
+def align_chunk(key, works, target, room, tell) -> list[Registration]:
+    """The alignment of each scan of a chunk to a shared target, on the host.
 
     Sizes depend on the target and the bucket alone, so that neither programs nor
     results depend on which scans share a chunk.
     """
-    voxel_size = key.voxel_size or chosen.get("voxel_size")
-    voxel_size = choose_voxel_size(target) if voxel_size is None else voxel_size
-    pyramid = chosen.get("pyramid") or Pyramid()
-    pyramid = without_sparse_levels([target], voxel_size, pyramid)
-    full = tuple(key.size if share else None for share in pyramid.voxels)
-    need = level_rooms([target], voxel_size, pyramid)
+    shared, points = target
+    full = tuple(key.size if share else None for share in shared.pyramid.voxels)
     rooms = tuple(
-        None if n is None else min(key.size, bucket(int(_MARGIN * n))) for n in need
+        None if n is None else min(key.size, bucket(int(_MARGIN * n)))
+        for n in shared.rooms([points])
     )
     tell(f"{len(works)} scans of up to {key.size} points, {room} at once")
-    align = lambda works, rooms: _aligned(
-        works, target, key.size, room, voxel_size, pyramid, rooms
-    )
+    align = lambda works, rooms: _aligned(works, shared, key.size, room, rooms)
     found = align(works, rooms)
     again = [
         i for i, x in enumerate(found) if bool(x.result == RESULTS.capacity_exceeded)
@@ -101,7 +90,7 @@ def align_chunk(key, works, target, chosen, room, tell) -> list[Registration]:
     return found
 
 
-def _aligned(works, target, size, room, voxel_size, pyramid, rooms):
+def _aligned(works, shared, size, room, rooms):
     """One compiled call for `room` scans, those that are missing empty."""
     missing = room - len(works)
     clouds = [PointCloud(work.source) for work in works]
@@ -111,7 +100,6 @@ def _aligned(works, target, size, room, voxel_size, pyramid, rooms):
     starts = [work.start for work in works]
     starts += [Rigid(np.eye(3), np.zeros(3))] * missing
     batched = jax.tree.map(lambda *rows: np.stack(rows), *starts)
-    settings = {"voxel_size": voxel_size, "pyramid": pyramid, "rooms": rooms}
-    found = register_many(sources, PointCloud(target), init=batched, **settings)
+    found = register_many(sources, shared, init=batched, rooms=rooms)
     found = jax.tree.map(np.asarray, found)
     return [jax.tree.map(lambda x, i=i: x[i], found) for i in range(len(works))]

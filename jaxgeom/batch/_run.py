@@ -11,6 +11,7 @@ import numpy as np
 
 from .. import __version__
 from .._core import RESULTS, GeometryError, message, name_of
+from ..pipelines import share_target
 from ..shapes import PointCloud
 from ..transforms import Rigid
 from ._chunks import Chunks, Key, align_chunk, size_bucket
@@ -99,6 +100,7 @@ class _Run:
         self.retry_failed, self.tell = retry_failed, tell
         self.chunks = Chunks(chunk)
         self.targets: collections.OrderedDict = collections.OrderedDict()
+        self.shared: collections.OrderedDict = collections.OrderedDict()
         self.tally = {**dict.fromkeys(STATES, 0), "skipped": 0}
 
     def take(self, scan):
@@ -122,8 +124,7 @@ class _Run:
                 self._end(scan, input_hash, "failed", *reason, None, seconds)
             return
         chosen = chosen if size is None else {**chosen, "voxel_size": size}
-        longest = max(len(source.points), len(target.points))
-        key = Key(scan.target, size, size_bucket(longest))
+        key = Key(scan.target, size, size_bucket(len(source.points)))
         work = Work(scan, source.points, start, input_hash)
         for ready in self.chunks.add(key, work, (target.points, chosen)):
             self._align(*ready)
@@ -138,10 +139,16 @@ class _Run:
         if url not in self.targets:
             target = read_points(url, "target")
             self.targets[url] = target, self.settings(PointCloud(target.points))
-        self.targets.move_to_end(url)
-        while len(self.targets) > _HELD_TARGETS:
-            self.targets.popitem(last=False)
+        _keep_last(self.targets, url)
         return self.targets[url]
+
+    def _shared(self, key, points, chosen):
+        """The prepared target of a chunk, and its points; the last few are kept."""
+        kind = (key.target, key.voxel_size)
+        if kind not in self.shared:
+            self.shared[kind] = share_target(PointCloud(points), **chosen)
+        _keep_last(self.shared, kind)
+        return self.shared[kind], points
 
     def _is_finished(self, name, input_hash):
         state = read_state(state_path(self.out, name))
@@ -157,7 +164,8 @@ class _Run:
         """Align a chunk; where that breaks, each scan alone, so that one fails."""
         started = time.perf_counter()
         try:
-            found = align_chunk(key, works, *target, room, self.tell)
+            shared = self._shared(key, *target)
+            found = align_chunk(key, works, shared, room, self.tell)
         except Exception as error:
             if len(works) > 1:
                 for work in works:
@@ -190,6 +198,13 @@ class _Run:
         self.tally[status] += 1
         if status == "failed":
             self.tell(f"{scan.id}: {code}: {text}")
+
+
+def _keep_last(held, key):
+    """Drop what was used least recently, except for `key` and a few more."""
+    held.move_to_end(key)
+    while len(held) > _HELD_TARGETS:
+        held.popitem(last=False)
 
 
 def _digest(url):

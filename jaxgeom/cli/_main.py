@@ -13,6 +13,8 @@ from . import _values as values
 
 OK, INTERNAL, USAGE, FILE, DATA, CHECK, SOME, INTERRUPTED = 0, 1, 2, 3, 4, 5, 6, 130
 
+# Commands whose work is divided among devices.
+_BATCHES = ("batch", "register_many")
 _EPILOG = """exit codes: 0 ok, 1 internal error, 2 usage, 3 file, 4 bad data,
 5 the result failed its own check, 6 some scans of a batch failed, 130 interrupted"""
 
@@ -23,6 +25,8 @@ def main(argv: list[str] | None = None) -> int:
     name = arguments.command.replace("-", "_")
     module = importlib.import_module(f"._{name}", __package__)
     _use_compile_cache()
+    if name in _BATCHES:
+        _use_every_core()
     from .._core import GeometryError
     from ..io import FileError
 
@@ -46,6 +50,18 @@ def main(argv: list[str] | None = None) -> int:
 def _complain(error, code):
     print(f"jaxgeom: error: {error}", file=sys.stderr)
     return code
+
+
+def _use_every_core():
+    """One CPU device per core, which share a batch; what was asked for stays."""
+    import jax
+
+    asked = "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if not asked and jax.config.jax_num_cpu_devices == -1:
+        # Not every system tells which cores this process may use.
+        own = getattr(os, "sched_getaffinity", None)
+        count = len(own(0)) if own else os.cpu_count()
+        jax.config.update("jax_num_cpu_devices", count)
 
 
 def _use_compile_cache():

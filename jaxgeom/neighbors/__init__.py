@@ -11,6 +11,8 @@ from ._host import HostTree as HostTree
 from ._knn import Neighbors as Neighbors
 from ._knn import build as build
 from ._knn import knn as knn
+from ._lists import CandidateLists as CandidateLists
+from ._lists import ListIndex as ListIndex
 from ._rays import RayHits as RayHits
 from ._rays import cast_rays as cast_rays
 from ._signed import AbstractSign as AbstractSign

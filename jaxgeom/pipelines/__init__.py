@@ -19,4 +19,6 @@ from ._reconstruct_many import reconstruct_many as reconstruct_many
 from ._register import MeanAligned as MeanAligned
 from ._register import register as register
 from ._register import register_jit as register_jit
-from ._register import register_many as register_many
+from ._register_many import SharedTarget as SharedTarget
+from ._register_many import register_many as register_many
+from ._register_many import share_target as share_target

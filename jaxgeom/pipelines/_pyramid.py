@@ -7,12 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from .._core import RESULTS, bucket, failure_where, first_failure
 from ..clouds import thin
 from ..normals import estimate
 from ..registration import (
+    AbstractCorrespondence,
     Method,
     PreparedTarget,
     Registration,
@@ -32,8 +33,9 @@ class Pyramid(eqx.Module):
     """The levels of an alignment, coarse first.
 
     Level i thins both clouds to one point per voxel of side `voxels[i]` times the voxel
-    size (0: all points), and pairs points up to `gates[i]` voxel sizes apart. Normals
-    that are not given are estimated on each level from `neighbors` points.
+    size (0: all points), and pairs points up to `gates[i]` voxel sizes apart. Levels
+    that only start the next one end at steps below `coarse_rtol` (the `rtol` of `icp`).
+    Normals that are not given are estimated on each level from `neighbors` points.
     """
 
     voxels: tuple[float, ...] = eqx.field(static=True, default=(4.0, 2.0, 0.5))
@@ -41,6 +43,7 @@ class Pyramid(eqx.Module):
     neighbors: int = eqx.field(static=True, default=12)
     method: Method = Method(objective=Symmetric())
     max_steps: int = eqx.field(static=True, default=50)
+    coarse_rtol: float = eqx.field(static=True, default=1e-3)
 
 
 def make_level(cloud: PointCloud, side, room: int | None, neighbors: int):
@@ -75,27 +78,30 @@ def align(
         make = partial(make_level, side=side, **sizes)
         small, need = jax.lax.map(make, pair)
         pick = lambda j: jax.tree.map(lambda x: x[j], small)
-        return pick(0), pick(1), jnp.max(need)
+        return pick(0), pick(1), _overflows(jnp.max(need), rooms[i])
 
     return _descend(level, voxel_size, init, rooms, pyramid)
 
 
 class TargetLevel(eqx.Module):
-    """A level of a target that many scans share, and how many points it needs."""
+    """A level of a target that many scans share, and whether its voxels did not fit."""
 
     target: PreparedTarget
-    need: Int[Array, ""]
+    overflow: Bool[Array, ""]
 
 
 def target_levels(
-    target: PointCloud, voxel_size, rooms: tuple[int | None, ...], pyramid: Pyramid
+    target: PointCloud,
+    voxel_size: Float[Array, ""],
+    rooms: tuple[int | None, ...],
+    pyramid: Pyramid,
+    rule: AbstractCorrespondence,
 ) -> tuple[TargetLevel, ...]:
-    """The levels of a target with their search structures, coarse first."""
+    """The levels of a target, coarse first, each prepared by the rule of pairs."""
     out = []
     for room, share in zip(rooms, pyramid.voxels, strict=True):
         small, need = make_level(target, share * voxel_size, room, pyramid.neighbors)
-        prepared = prepare_target(small, pyramid.method.correspondence)
-        out.append(TargetLevel(prepared, need))
+        out.append(TargetLevel(prepare_target(small, rule), _overflows(need, room)))
     return tuple(out)
 
 
@@ -111,24 +117,25 @@ def align_to(
 
     def level(i, side):
         small, need = make_level(source, side, rooms[i], pyramid.neighbors)
-        return small, levels[i].target, jnp.maximum(need, levels[i].need)
+        full = levels[i].overflow | _overflows(need, rooms[i])
+        return small, levels[i].target, full
 
     return _descend(level, voxel_size, init, rooms, pyramid)
 
 
 def _descend(level, voxel_size, init, rooms, pyramid) -> Registration:
-    """Down the levels; `level(i, side)` gives source, target and the room they need."""
+    """Down the levels; `level(i, side)` gives source, target, and if room lacks."""
     steps, overflow = jnp.zeros((), jnp.int32), jnp.asarray(False)
-    for i, room in enumerate(rooms):
+    for i in range(len(rooms)):
         side = _after(pyramid.voxels[i] * voxel_size, steps)
-        source, target, need = level(i, side)
-        if room is not None:
-            overflow = overflow | (need > room)
+        source, target, full = level(i, side)
+        overflow = overflow | full
         found = icp(
             *(source, target),
             init=init,
             method=pyramid.method,
             max_distance=pyramid.gates[i] * voxel_size,
+            rtol=None if i == len(rooms) - 1 else pyramid.coarse_rtol,
             max_steps=pyramid.max_steps,
         )
         init, steps = found.target_from_source, steps + found.num_steps
@@ -137,6 +144,11 @@ def _descend(level, voxel_size, init, rooms, pyramid) -> Registration:
     )
     where = lambda r: (r.num_steps, r.result)
     return eqx.tree_at(where, found, (steps, result))
+
+
+def _overflows(need, room):
+    """Whether more voxels hold points than there is room for; None is always enough."""
+    return jnp.asarray(False) if room is None else need > room
 
 
 def _after(value, steps):

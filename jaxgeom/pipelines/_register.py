@@ -10,14 +10,11 @@ from .._core import RESULTS, GeometryError, bucket, message
 from ..registration import Registration
 from ..shapes import PointCloud
 from ..transforms import Affine, Rigid, Similarity
-from ._devices import gathered, on_each, placed
 from ._pyramid import (
     Pyramid,
     align,
-    align_to,
     choose_voxel_size,
     level_rooms,
-    target_levels,
     without_sparse_levels,
 )
 
@@ -69,11 +66,11 @@ def register(
     pyramid = without_sparse_levels(points, voxel_size, pyramid)
     rooms = level_rooms(points, voxel_size, pyramid)
     found = _run(
-        *pair, jnp.asarray(voxel_size, dtype), _as(start, dtype), rooms, pyramid
+        *pair, jnp.asarray(voxel_size, dtype), as_dtype(start, dtype), rooms, pyramid
     )
     if throw:
         _raise_for(found)
-    moved = _conjugated(_as(found.target_from_source, np.float64), -center)
+    moved = conjugated(as_dtype(found.target_from_source, np.float64), -center)
     return eqx.tree_at(lambda r: r.target_from_source, found, moved)
 
 
@@ -103,111 +100,13 @@ def register_jit(
     return align(source, target, voxel_size, start, rooms, pyramid)
 
 
-def register_many(
-    sources: PointCloud,
-    target: PointCloud,
-    *,
-    voxel_size: float | None = None,
-    init: Rigid | Similarity | Affine | None = None,
-    pyramid: Pyramid | None = None,
-    rooms: tuple[int | None, ...] | None = None,
-    chunk: int = 1,
-) -> Registration:
-    """The alignments of a batch of scans, in one compiled call; fields are batched.
-
-    **Arguments:** as `register`, and
-
-    - `sources`: ragged scans as one batch [b, n, 3] with masks, of `stack`.
-    - `target`: one cloud for all, or a batch [b, m, 3] with one for each.
-    - `init`: batched transforms; identity by default.
-    - `rooms`: the capacity of every level, such as of `level_rooms`, so that batches
-      of one size share one program; by default what this batch needs, without levels
-      on which its scans are sparse.
-    - `chunk`: how many each device aligns at once; memory grows with it. One at a
-      time is fastest on a CPU.
-
-    The batch is divided among all local devices. Every item has its own status; none
-    is ever raised. Raises `GeometryError` where the shapes do not go together.
-    """
-    pyramid = Pyramid() if pyramid is None else pyramid
-    _check_batches(sources, target)
-    b = sources.points.shape[0]
-    shared = target.points.ndim == 2
-    if shared:
-        target = jax.tree.map(lambda x: np.asarray(x)[None], target)
-    batches = [_masked(cloud) for cloud in (sources, target)]
-    rows = [points[mask] for points, mask in _rows(batches)]
-    some = [points for points in rows if len(points)]
-    if voxel_size is None:
-        voxel_size = float(np.median([choose_voxel_size(p) for p in some] or [1.0]))
-    if rooms is None:
-        some = some or [np.zeros((1, 3))]
-        pyramid = without_sparse_levels(some, voxel_size, pyramid)
-        rooms = level_rooms(some, voxel_size, pyramid)
-    center = np.stack([_mean(points) for points in rows[b:]])
-    center = np.broadcast_to(center, (b, 3))
-    start = _identities(b) if init is None else _as(init, np.float64)
-    start = _conjugated(start, center)
-    sources, targets = _same_size(batches, center)
-    dtype = sources.points.dtype
-    size = jnp.asarray(voxel_size, dtype)
-    common = None
-    if shared:
-        common = _target_levels(targets, size, rooms, pyramid)
-        targets = None
-    items, mesh = placed((sources, targets, _as(start, dtype)))
-    found = _run_many(items, common, size, rooms, pyramid, chunk, mesh)
-    found = found if mesh is None else gathered(found, b)
-    moved = _conjugated(_as(found.target_from_source, np.float64), -center)
-    return eqx.tree_at(lambda r: r.target_from_source, found, moved)
-
-
 _run = eqx.filter_jit(align)
-
-
-def _check_batches(sources, target):
-    """Raise for sources that are no batch, and for another number of targets."""
-    b, shape = sources.points.shape[0], target.points.shape
-    if sources.points.ndim == 3 and (len(shape) == 2 or shape[0] == b):
-        return
-    raise GeometryError(
-        message(
-            "sources must be a batch [b, n, 3], and target one cloud or b of them",
-            f"sources {tuple(sources.points.shape)}, target {tuple(shape)}",
-            "Make batches with stack.",
-        )
-    )
-
-
-@eqx.filter_jit
-def _target_levels(targets, voxel_size, rooms, pyramid):
-    """The levels of the one target of a batch."""
-    one = jax.tree.map(lambda x: x[0], targets)
-    return target_levels(one, voxel_size, rooms, pyramid)
-
-
-@eqx.filter_jit
-def _run_many(items, common, voxel_size, rooms, pyramid, chunk, mesh):
-    arrays, static = eqx.partition(common, eqx.is_array)
-
-    def run(items, given):
-        common, voxel_size = eqx.combine(given[0], static), given[1]
-
-        def one(item):
-            source, target, start = item
-            if target is None:
-                return align_to(source, common, voxel_size, start, rooms, pyramid)
-            return align(source, target, voxel_size, start, rooms, pyramid)
-
-        return jax.lax.map(one, items, batch_size=chunk)
-
-    return on_each(run, mesh)(items, (arrays, voxel_size))
 
 
 def _checked(cloud, name) -> PointCloud:
     """The finite points of a cloud, on the host."""
     cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(cloud)
-    finite = _masked(cloud).trim()
+    finite = masked(cloud).trim()
     if len(finite.points) < _FEWEST:
         raise GeometryError(
             message(
@@ -219,7 +118,7 @@ def _checked(cloud, name) -> PointCloud:
     return finite
 
 
-def _masked(cloud) -> PointCloud:
+def masked(cloud) -> PointCloud:
     """The cloud on the host, with points and normals that are not finite masked."""
     points = np.asarray(cloud.points)
     mask = np.asarray(cloud.mask) & np.isfinite(points).all(axis=-1)
@@ -233,30 +132,16 @@ def _masked(cloud) -> PointCloud:
     return eqx.tree_at(where, cloud, (points, normals, mask, {}), is_leaf=none)
 
 
-def _rows(batches):
-    """The points and masks of all items: of the sources, then of the targets."""
-    for cloud in batches:
-        yield from zip(np.asarray(cloud.points, np.float64), cloud.mask, strict=True)
-
-
-def _mean(points):
-    return points.mean(axis=0) if len(points) else np.zeros(3)
-
-
 def _start(init, source, target, center):
     """The transform to start from, between points about the center."""
     if init is None:
         return Rigid(np.eye(3), np.zeros(3))
     if isinstance(init, MeanAligned):
         return Rigid(np.eye(3), target.mean(axis=0) - source.mean(axis=0))
-    return _conjugated(_as(init, np.float64), center)
+    return conjugated(as_dtype(init, np.float64), center)
 
 
-def _identities(b):
-    return Rigid(np.broadcast_to(np.eye(3), (b, 3, 3)), np.zeros((b, 3)))
-
-
-def _conjugated(transform, center):
+def conjugated(transform, center):
     """The transforms in coordinates about `center`, batched or not."""
     linear, shift = _parts(transform)
     turned = np.einsum("...ij,...j->...i", linear, center)
@@ -271,7 +156,7 @@ def _parts(transform):
     return scale[..., None, None] * transform.rotation, transform.translation
 
 
-def _as(transform, dtype):
+def as_dtype(transform, dtype):
     return jax.tree.map(lambda x: np.asarray(x).astype(dtype), transform)
 
 
@@ -289,26 +174,6 @@ def _padded(clouds, points):
         )
         for cloud, p in zip(clouds, points, strict=True)
     ]
-
-
-def _same_size(batches, center):
-    """Both batches about the centers, padded to one bucket."""
-    dtype = jax.dtypes.canonicalize_dtype(batches[0].points.dtype)
-    size = bucket(max(cloud.points.shape[1] for cloud in batches))
-    normals = all(cloud.normals is not None for cloud in batches)
-    where = lambda c: (c.points, c.normals, c.mask)
-    out = []
-    for cloud in batches:
-        room = [(0, 0), (0, size - cloud.points.shape[1])]
-        mask = np.pad(cloud.mask, room)
-        wash = lambda x, mask=mask, room=room: jnp.asarray(
-            np.where(mask[..., None], np.pad(x, [*room, (0, 0)]), 0).astype(dtype)
-        )
-        offset = center[: len(cloud.points), None]
-        points = wash(np.asarray(cloud.points, np.float64) - offset)
-        parts = (points, wash(cloud.normals) if normals else None, jnp.asarray(mask))
-        out.append(eqx.tree_at(where, cloud, parts, is_leaf=lambda x: x is None))
-    return out
 
 
 def _raise_for(found):

@@ -1,6 +1,7 @@
 """Alignment: closest points by composition, features, consensus among wrong pairs."""
 
 from ._anderson import Anderson as Anderson
+from ._correspondences import AbstractCorrespondence as AbstractCorrespondence
 from ._correspondences import ClosestSurface as ClosestSurface
 from ._correspondences import DistanceField as DistanceField
 from ._correspondences import Facing as Facing

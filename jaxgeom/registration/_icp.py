@@ -17,6 +17,7 @@ _SETTLED = 0.99
 
 class _State(eqx.Module):
     pose: Rigid | Similarity | Affine
+    anchor: Rigid | Similarity | Affine
     found: Found
     memory: PyTree
     width: Float[Array, ""]
@@ -40,8 +41,8 @@ def icp(
 
     Pairs every source point with a place of the target, makes one step of the solver on
     sum_i w_i width^2 rho(|r_i|^2 / width^2), and pairs anew, until a step is shorter
-    than `rtol`. What r, rho, the pairs, the step and the transforms are, is the choice
-    of `method`.
+    than `rtol`, or comes back so near to an earlier pose. What r, rho, the pairs, the
+    step and the transforms are, is the choice of `method`.
 
     **Arguments:**
 
@@ -101,12 +102,16 @@ def _iterate(scene, pose, rtol, max_steps, history) -> _State:
         move = _pick(some, step.transform, _still(step.transform))
         settled = problem.width >= _SETTLED * state.width
         settled = settled | ~jnp.isfinite(problem.width)
-        done = (_step_size(move, scene) <= rtol) & settled & ~step.stuck
         pose = move @ state.pose
-        done = (track.steps > 0) & done
+        # Pairs may alternate for ever: then poses come back (Brent 1980).
+        still = _apart(pose, state.pose, scene) <= rtol
+        still = still | (_apart(pose, state.anchor, scene) <= rtol)
+        done = (track.steps > 0) & still & settled & ~step.stuck
+        mark = jax.lax.population_count(track.steps) == 1
         history = _recorded(track, problem)
         return _State(
             pose,
+            _pick(mark, pose, state.anchor),
             scene.match(pose, state.found),
             _pick(some, step.memory, state.memory),
             problem.width,
@@ -118,6 +123,7 @@ def _iterate(scene, pose, rtol, max_steps, history) -> _State:
         lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(scene.match, pose)
     )
     start = _State(
+        pose,
         pose,
         nothing,
         solver.start(scene.tangent.basis.shape[1], dtype),
@@ -146,12 +152,10 @@ def _recorded(track, problem):
     return track.history.at[track.steps - 1].set(cost)
 
 
-def _step_size(step, scene):
-    """The largest of the entries of M - I and of the shift in units of the size."""
-    eye = jnp.eye(3, dtype=scene.center.dtype)
-    size = scene.size
-    linear = jnp.max(jnp.abs(step.linear() - eye))
-    return jnp.maximum(linear, jnp.max(jnp.abs(step.shift())) / size)
+def _apart(a, b, scene):
+    """The largest difference of linear parts, and of shifts in units of the size."""
+    shift = jnp.max(jnp.abs(a.shift() - b.shift())) / scene.size
+    return jnp.maximum(jnp.max(jnp.abs(a.linear() - b.linear())), shift)
 
 
 def icp_unrolled(

@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-_BISECTIONS = 26
+# Ends at 2^-27 of the largest.
+_PARTS, _DIVISIONS = 8, 9
 # The median of |r| of Gaussian residuals is this share of their standard deviation.
 _NORMAL_MEDIAN = 0.6745
 
@@ -187,17 +188,20 @@ def quantile(
 ) -> Float[Array, ""]:
     """The root of the square that the given share of the pairs stays at or below.
 
-    By bisection: passes over the data are cheaper than a sort.
+    By repeated division into parts: passes over the data are cheaper than a sort, and
+    few passes cheaper than many.
     """
     wanted = share * jnp.sum(mask).astype(squares.dtype)
     top = jnp.sqrt(jnp.max(jnp.where(mask, squares, 0), initial=0))
+    parts = jnp.arange(1, _PARTS, dtype=squares.dtype) / _PARTS
 
-    def halve(_, ends):
+    def divide(_, ends):
         low, high = ends
-        middle = (low + high) / 2
-        below = jnp.sum(mask & (squares <= middle**2)).astype(squares.dtype)
-        enough = below >= wanted
-        return jnp.where(enough, low, middle), jnp.where(enough, middle, high)
+        between = low + parts * (high - low)
+        below = mask & (squares <= between[:, None] ** 2)
+        enough = jnp.sum(below, axis=1).astype(squares.dtype) >= wanted
+        low = jnp.max(jnp.where(enough, low, between))
+        return low, jnp.min(jnp.where(enough, between, high))
 
     low = jnp.zeros_like(top)
-    return jax.lax.fori_loop(0, _BISECTIONS, halve, (low, top))[1]
+    return jax.lax.fori_loop(0, _DIVISIONS, divide, (low, top))[1]

@@ -50,7 +50,7 @@ class Problem(eqx.Module):
         """The rows of every pair after the step z."""
         step = self.model.exp(self.tangent.basis @ z)
         matrix, shift = step.linear(), step.shift()
-        points = matrix @ self.points + shift[:, None]
+        points = _times(matrix, self.points) + shift[:, None]
         normals = _turned(matrix, self.normals)
         return self._rows(points, normals)
 
@@ -82,10 +82,10 @@ class Problem(eqx.Module):
         def rows(z):
             # To first order the step is x + G x + v, and normals turn by -G^T.
             matrix, shift = self.model.generator(self.tangent.basis @ z)
-            points = self.points + matrix @ self.points + shift[:, None]
-            normals = self.normals - matrix.T @ self.normals
-            drift = jnp.sum(self.normals * (normals - self.normals), axis=0)
-            return self._rows(points, normals - drift * self.normals)
+            points = self.points + _times(matrix, self.points) + shift[:, None]
+            turn = _times(matrix.T, self.normals)
+            drift = sum(a * b for a, b in zip(self.normals, turn, strict=True))
+            return self._rows(points, self.normals - turn + drift * self.normals)
 
         zero = jnp.zeros(self.size, self.points.dtype)
         at_zero, push = jax.linearize(rows, zero)
@@ -153,8 +153,11 @@ def problem_of(
     """The problem of the pairs where `mask`."""
     wash = lambda x: jnp.where(mask, x.T, 0)
     normals = jnp.zeros_like(moved.points) if moved.normals is None else moved.normals
+    given = (moved.points, normals, places.points, places.normals)
+    # Written down once: XLA would look the places up again wherever they are used.
+    written = jax.lax.optimization_barrier(tuple(wash(x) for x in given))
     return Problem(
-        *(wash(moved.points), wash(normals), wash(places.points), wash(places.normals)),
+        *written,
         jnp.where(mask, weights, 0),
         width,
         **parts,
@@ -163,7 +166,14 @@ def problem_of(
 
 def _turned(matrix, normals):
     """M^-T n, of unit length."""
-    turned = jnp.linalg.inv(matrix).T @ normals
-    square = jnp.sum(turned**2, axis=0)
+    turned = _times(jnp.linalg.inv(matrix).T, normals)
+    square = sum(x**2 for x in turned)
     some = square > 0
     return jnp.where(some, turned / jnp.sqrt(jnp.where(some, square, 1)), 0)
+
+
+def _times(matrix: Float[Array, "3 3"], rows: Float[Array, "3 n"]):
+    """matrix @ rows, written out: on a CPU a call for so small a product costs more
+    than the product."""
+    part = lambda row: sum(row[j] * rows[j] for j in range(3))
+    return jnp.stack([part(row) for row in matrix])

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxgeom._core import RESULTS, GeometryError
-from jaxgeom.neighbors import BruteForce, CellList, HostTree, build, knn
+from jaxgeom.neighbors import BruteForce, CandidateLists, CellList, HostTree, build, knn
 
 N, Q = 1200, 300
 
@@ -65,6 +65,30 @@ def test_equals_a_tree(name, backend):
     _assert_exact(points, queries, 5, find(points, queries))
 
 
+@pytest.mark.parametrize("name", CLOUDS)
+def test_lists_equal_a_tree(name):
+    """On the points, a little beside them (a few rows in doubt), and elsewhere."""
+    points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS[name])
+    rng = np.random.default_rng(3)
+    size = 0.02 * jnp.max(jnp.ptp(points, axis=0))
+    beside = points[:Q] + size * rng.normal(size=(Q, 3)).astype(np.float32)
+    index = build(points, backend=CandidateLists())
+    find = jax.jit(lambda q: knn(index, q, 2))
+    for asked in (points[-Q:], beside, queries):
+        _assert_exact(points, asked, 2, find(asked))
+
+
+def test_lists_decide_most_queries_near_the_points():
+    points = jnp.asarray(CLOUDS["surface"][0], jnp.float32)
+    index = build(points, backend=CandidateLists())
+    beside = points + 0.02 * np.random.default_rng(3).normal(size=(N, 3))
+    certain = index.from_lists(beside.astype(jnp.float32), 2, jnp.float32(jnp.inf))[1]
+    assert certain.mean() > 0.9
+    # Far away only the gate decides: nothing can be within it.
+    far = points[:Q] + 100
+    assert not index.from_lists(far, 2, jnp.float32(jnp.inf))[1].any()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("k", [1, pytest.param(64, marks=pytest.mark.slow)])
 def test_other_counts_of_neighbors(k):
@@ -74,7 +98,9 @@ def test_other_counts_of_neighbors(k):
     )
 
 
-@pytest.mark.parametrize("backend", [CellList(3), BruteForce(), HostTree()])
+@pytest.mark.parametrize(
+    "backend", [CellList(3), BruteForce(), CandidateLists(), HostTree()]
+)
 def test_padding_and_missing_neighbors(backend):
     points, queries = CLOUDS["volume"]
     points, queries = jnp.asarray(points[:40]), jnp.asarray(queries[:9])
@@ -88,7 +114,9 @@ def test_padding_and_missing_neighbors(backend):
     assert bool(out.result == RESULTS.too_few_points)
 
 
-@pytest.mark.parametrize("backend", [CellList(6), BruteForce(), HostTree()])
+@pytest.mark.parametrize(
+    "backend", [CellList(6), BruteForce(), CandidateLists(), HostTree()]
+)
 def test_max_distance_is_a_gate(backend):
     points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS["volume"])
     gate = 0.8
@@ -101,7 +129,9 @@ def test_max_distance_is_a_gate(backend):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backend", [CellList(), BruteForce(), HostTree(workers=1)])
+@pytest.mark.parametrize(
+    "backend", [CellList(), BruteForce(), CandidateLists(), HostTree(workers=1)]
+)
 def test_vmap_is_a_loop(backend):
     names = ["surface", "volume", "plane"]
     points = jnp.asarray(np.stack([CLOUDS[n][0][:500] for n in names]), jnp.float32)

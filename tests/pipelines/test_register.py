@@ -13,10 +13,12 @@ from jaxgeom._core import RESULTS, GeometryError
 from jaxgeom.pipelines import (
     MeanAligned,
     Pyramid,
-    _register,
+    SharedTarget,
+    _register_many,
     register,
     register_jit,
     register_many,
+    share_target,
 )
 
 # One size, two levels: all script-form tests without normals share one program.
@@ -156,6 +158,11 @@ def test_clear_errors():
         register(source[:, :2], target)
     with pytest.raises(GeometryError, match="sources must be a batch"):
         register_many(PointCloud(source), PointCloud(target))
+    with pytest.raises(GeometryError, match="own voxel_size and pyramid"):
+        shared = SharedTarget((), target[0], VOXEL, TWO)
+        register_many(stack([PointCloud(source)]), shared, voxel_size=VOXEL)
+    with pytest.raises(GeometryError, match="target must have finite points"):
+        share_target(PointCloud(target, mask=np.zeros(N, bool)))
     with pytest.raises(GeometryError, match="sources must be a batch"):
         many = [stack([PointCloud(target)] * b) for b in (2, 3)]
         register_many(*many)
@@ -170,9 +177,9 @@ def _batch():
 
 
 def test_many_are_each_as_alone_and_share_one_program(monkeypatch):
-    traces, align = [], _register.align_to
+    traces, align = [], _register_many.align_to
     counted = lambda *args: (traces.append(1), align(*args))[1]
-    monkeypatch.setattr(_register, "align_to", counted)
+    monkeypatch.setattr(_register_many, "align_to", counted)
     sources, target = _batch()
     settings = {"voxel_size": VOXEL, "pyramid": TWO}
     together = register_many(stack(sources), target, **settings)
@@ -206,11 +213,12 @@ def _shorter(sources):
 def test_one_target_for_all_and_one_for_each_give_the_same_poses():
     sources, target = _batch()
     settings = {"voxel_size": VOXEL, "pyramid": TWO}
-    shared, paired = (
-        register_many(stack(_shorter(sources)), targets, **settings)
-        for targets in (target, stack([target] * len(sources)))
-    )
-    np.testing.assert_array_equal(shared.num_steps, paired.num_steps)
+    rows = stack(_shorter(sources))
+    several = stack([target] * len(sources))
+    paired, shared = (register_many(rows, t, **settings) for t in (several, target))
+    listed = register_many(rows, share_target(target, **settings))
     # The last has too few points: some of its moves cost nothing.
-    shifts = [x.target_from_source.translation[:4] for x in (shared, paired)]
-    np.testing.assert_allclose(*shifts, atol=2e-6)
+    for found in (shared, listed):
+        np.testing.assert_array_equal(found.num_steps[:4], paired.num_steps[:4])
+        shifts = [x.target_from_source.translation[:4] for x in (found, paired)]
+        np.testing.assert_allclose(*shifts, atol=2e-6)

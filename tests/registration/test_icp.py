@@ -126,6 +126,21 @@ MORE_SOLVERS = [
 SOLVERS += [pytest.param(m, marks=pytest.mark.slow) for m in MORE_SOLVERS]
 
 
+@pytest.mark.parametrize("seed", [11, 12, 18])
+def test_pairs_that_alternate_end_the_search(seed):
+    """Noise makes these searches go round for ever; all poses of the round will do."""
+    points, normals = _surface(N, seed)
+    points = points + 0.02 * np.random.default_rng(seed).normal(size=points.shape)
+    source, target = _padded(points, normals), _pair()[1]
+    method = _method(objective=Symmetric())
+    found = align(source, target, method=method)
+    assert found.result == RESULTS.successful and found.num_steps < 20
+    # Without a tolerance it goes on, and never comes to rest nor gets anywhere.
+    long = align(source, target, method=method, rtol=jnp.float32(-1), max_steps=200)
+    assert long.result == RESULTS.not_converged
+    assert _off(found, Rigid.log(long.target_from_source)) < 1e-3
+
+
 @pytest.mark.parametrize("method", SOLVERS, ids=lambda m: str(m)[:10])
 def test_every_composition_finds_the_motion(method):
     source, target = _pair()

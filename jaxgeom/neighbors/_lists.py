@@ -1,0 +1,171 @@
+"""Exact neighbors by lists of candidates, made once for points that are searched often.
+
+Every cell of a grid lists the points nearest to its center x, c_1 to c_m. A point that
+is not in the list is at least |x - c_m| from x, and so at least |x - c_m| - |q - x|
+from a query q of that cell (triangle inequality). Neighbors from the list that are
+nearer than this are certainly right; the other queries are searched in cells and tree.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ._backends import AbstractBackend, AbstractIndex, usable
+from ._brute import BruteForce
+from ._cells import CellIndex, CellList
+from ._tree import Nearest, insert
+
+# The grid reaches beyond the points by this share of their extent.
+_MARGIN = 0.1
+# Picking a neighbor reads the whole list: for more of them the cells are faster.
+_MANY = 4
+# Up to so many queries in doubt are compared with every point.
+_FEW = 32
+# A table of so many cells takes 68 MB with lists of 16.
+_MOST_CELLS = 2**18
+# Centers whose lists are made at a time.
+_TILE = 2**15
+
+
+class ListIndex(AbstractIndex):
+    """Points, and the candidates of every cell of a grid about them.
+
+    A row of `table` holds the x, the y and the z of the candidates of a cell, nearest
+    to its center first, and the distance within which there is no other point.
+    """
+
+    points: Float[Array, "n 3"]
+    mask: Bool[Array, " n"]
+    rest: CellIndex
+    low: Float[Array, " 3"]
+    width: Float[Array, ""]
+    counts: Int[Array, " 3"]
+    table: Float[Array, "c w"]
+    items: Int[Array, "c m"]
+
+    @eqx.filter_jit
+    def search(self, queries, active, k, reach):
+        if k > min(_MANY, self.items.shape[1]):
+            return self.rest.search(queries, active, k, reach)
+        found, certain = self.from_lists(queries, k, reach)
+        doubtful = active & ~certain
+        count = jnp.sum(doubtful)
+        ways = (self._as_found, self._with_few_again, self._with_many_again)
+        way = jnp.where(count > min(_FEW, queries.shape[0]), 2, jnp.minimum(count, 1))
+        again = [lambda *args, f=f: f(*args, k, reach) for f in ways]
+        return jax.lax.switch(way, again, queries, doubtful, found)
+
+    def _as_found(self, queries, doubtful, found, k, reach):
+        return found
+
+    def _with_few_again(self, queries, doubtful, found, k, reach):
+        """The doubtful rows compared with every point: a walk costs more for so few."""
+        rows = jnp.nonzero(doubtful, size=_FEW, fill_value=queries.shape[0])[0]
+        few = queries.at[rows].get(mode="fill", fill_value=0)
+        items = (
+            BruteForce(_FEW)
+            .build(self.points, self.mask)
+            .search(few, rows < queries.shape[0], k, reach)
+        )
+        return found.at[rows].set(items, mode="drop")
+
+    def _with_many_again(self, queries, doubtful, found, k, reach):
+        items = self.rest.search(queries, doubtful, k, reach)
+        return jnp.where(doubtful[:, None], items, found)
+
+    def from_lists(self, queries, k, reach):
+        """The k nearest of the candidates, and which rows are certainly right."""
+        n, m = self.points.shape[0], self.items.shape[1]
+        cell = jnp.floor((queries - self.low) / self.width)
+        cell = jnp.clip(cell, 0, (self.counts - 1).astype(cell.dtype))
+        center = self.low + (cell + 0.5) * self.width
+        row = _row(cell.astype(jnp.int32), self.counts)
+        # Candidates first: what is compared lies side by side for all queries.
+        entry = self.table.at[row].get(mode="promise_in_bounds").T
+        axis = lambda d: entry[d * m : (d + 1) * m]
+        squares = sum((axis(d) - queries[:, d]) ** 2 for d in range(3))
+        # Written down once: XLA would compute it again for each of the k places.
+        squares = jax.lax.optimization_barrier(squares)
+        rows = (k, queries.shape[0])
+        best = Nearest(
+            jnp.full(rows, jnp.inf, squares.dtype), jnp.zeros(rows, jnp.int32)
+        )
+        take = lambda j, best: insert(best, squares[j], j)
+        best = jax.lax.fori_loop(0, m, take, best)
+        there = (best.squares <= reach) & (best.squares < jnp.inf)
+        found = jnp.where(there, self.items[row, best.items], n).T
+        away = jnp.sqrt(jnp.sum((queries - center) ** 2, axis=1))
+        need = jnp.sqrt(jnp.minimum(best.squares[-1], reach))
+        size = jnp.max(jnp.abs(queries), axis=1) + jnp.max(jnp.abs(self.low))
+        rounding = 32 * jnp.finfo(queries.dtype).eps * size
+        return found, need + away + rounding < entry[-1]
+
+
+class CandidateLists(AbstractBackend):
+    """List the `length` nearest points of every cell of a grid, `per_point` cells for
+    every point.
+
+    Building takes a hundred times as long as that of a `CellList`; searches of up to
+    four neighbors near the points are several times as fast afterwards. For a target
+    that many scans are laid on. Any k is exact.
+    """
+
+    length: int = eqx.field(static=True, default=16)
+    per_point: int = eqx.field(static=True, default=12)
+
+    @eqx.filter_jit
+    def build(self, points, mask):
+        given, real = points, mask
+        points, mask = usable(points, mask)
+        n = points.shape[0]
+        m, cells = min(self.length, n), min(self.per_point * n, _MOST_CELLS)
+        rest = CellList(neighbors=m).build(points, mask)
+        low, width, counts = _grid(rest.low, rest.high, cells)
+        number = jnp.arange(cells, dtype=jnp.int32)
+        centers = low + (_cell(number, counts) + 0.5) * width
+        inside = number < jnp.prod(counts)
+        items = _listed(rest, centers, inside, m)
+        there = points.at[items].get(mode="fill", fill_value=jnp.inf)
+        last = there[:, -1]
+        last = jnp.sqrt(jnp.sum((last - centers) ** 2, axis=1))
+        # A list with room to spare has all points.
+        last = jnp.where(items[:, -1] < n, last, jnp.inf)
+        table = jnp.concatenate([*(there[..., d] for d in range(3)), last[:, None]], 1)
+        near = CellList().build(points, mask)
+        return ListIndex(given, real, near, low, width, counts, table, items)
+
+
+def _grid(low, high, cells):
+    """The lower corner, the width and the numbers of at most `cells` cubes."""
+    side = jnp.max(high - low)
+    margin = jnp.where(side > 0, _MARGIN * side, 0.5)
+    low, extent = low - margin, high - low + 2 * margin
+    counts = lambda width: jnp.ceil(extent / width)
+    start = jnp.cbrt(jnp.prod(extent) / cells)
+    over = lambda width: jnp.prod(counts(width)) > cells
+    width = jax.lax.while_loop(over, lambda width: 1.05 * width, start)
+    return low, width, counts(width).astype(jnp.int32)
+
+
+def _row(cell, counts):
+    return (cell[:, 0] * counts[1] + cell[:, 1]) * counts[2] + cell[:, 2]
+
+
+def _cell(number, counts) -> Int[Array, "c 3"]:
+    """The cell of a row, the other way round."""
+    column, z = jnp.divmod(number, counts[2])
+    return jnp.stack([*jnp.divmod(column, counts[1]), z], axis=1)
+
+
+def _listed(index, centers, wanted, m):
+    """The m points nearest to every center, tile by tile."""
+    reach = jnp.asarray(jnp.inf, centers.dtype)
+    count = centers.shape[0]
+    size = min(_TILE, count)
+    tiles = -(-count // size)
+    pad = lambda x: jnp.pad(x, [(0, tiles * size - count)] + [(0, 0)] * (x.ndim - 1))
+    fold = lambda x: pad(x).reshape(tiles, size, *x.shape[1:])
+    find = lambda pair: index.search(*pair, m, reach)
+    items = jax.lax.map(find, (fold(centers), fold(wanted)))
+    return items.reshape(-1, m)[:count]
