@@ -51,7 +51,7 @@ class CellIndex(AbstractIndex):
     @eqx.filter_jit
     def search(self, queries, active, k, reach):
         near = _search_near(self, queries, active, k, reach)
-        for again in (_search_wider, _search_tree):
+        for again in (_search_wider, search_in_tree):
             wanted = active & ~near.certain
             near = jax.lax.cond(
                 jnp.any(wanted),
@@ -64,7 +64,7 @@ class CellIndex(AbstractIndex):
         return near.items
 
 
-class _Near(eqx.Module):
+class Near(eqx.Module):
     """The k nearest so far, how far to search yet (squared), and if that is certain."""
 
     items: Int[Array, "q k"]
@@ -145,14 +145,14 @@ def _cell_id(cell, counts):
     return (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]
 
 
-def _search_near(index, queries, active, k, reach) -> _Near:
+def _search_near(index, queries, active, k, reach) -> Near:
     """Every active query in the cells around it, lists of similar length together."""
     q = queries.shape[0]
     rows, count = _listed(active)
     if k >= _MANY and q > _TILE:
         length = jnp.where(active, _block(index, queries, index.span).total, _NEVER)
         _, rows = jax.lax.sort((length, jnp.arange(q, dtype=jnp.int32)), num_keys=1)
-    blank = _Near(
+    blank = Near(
         jnp.full((q, k), index.points.shape[0], jnp.int32),
         jnp.full(q, reach, queries.dtype),
         ~active,
@@ -197,7 +197,7 @@ def _block(index, queries, span) -> _Block:
     return _Block(first, final, ends, begin + length - ends, ends[-1])
 
 
-def _search_cells(index, queries, active, k, reach, span) -> _Near:
+def _search_cells(index, queries, active, k, reach, span) -> Near:
     """The k nearest in the cube of `span`^3 cells around each query."""
     n = index.points.shape[0]
     block = _block(index, queries, span)
@@ -210,7 +210,7 @@ def _search_cells(index, queries, active, k, reach, span) -> _Near:
     found = index.order.at[positions].get(mode="fill", fill_value=n)
     room = _room(index, queries, block.first, block.final)
     least = jnp.minimum(squares[-1], reach)
-    return _Near(found.T, least, (block.total <= longest) & (least <= room))
+    return Near(found.T, least, (block.total <= longest) & (least <= room))
 
 
 def _nearest_in_list(index, queries, block, length, longest, k) -> Nearest:
@@ -252,13 +252,13 @@ def _room(index, queries, first, final):
     return jnp.maximum(room, 0) ** 2
 
 
-def _search_wider(index, queries, wanted, near, k, reach) -> _Near:
+def _search_wider(index, queries, wanted, near, k, reach) -> Near:
     """`near`, with the wanted rows searched in more cells."""
     queue, span = _listed(wanted), index.span + 2
     return _search_tiles(index, queries, queue, near, k, reach, span, _FEW)
 
 
-def _search_tiles(index, queries, queue, near, k, reach, span, size) -> _Near:
+def _search_tiles(index, queries, queue, near, k, reach, span, size) -> Near:
     """`near`, with the first `count` of the rows searched, a tile of them at a time."""
     rows, count = queue
     q = queries.shape[0]
@@ -286,7 +286,7 @@ def _listed(wanted):
     return rows, jnp.sum(wanted, dtype=jnp.int32)
 
 
-def _search_tree(index, queries, wanted, near, k, reach) -> _Near:
+def search_in_tree(index, queries, wanted, near, k, reach) -> Near:
     """`near`, with the wanted rows searched in the tree."""
     # The same distance may be rounded differently here and in the cells.
     limits = near.limits * (1 + 8 * jnp.finfo(near.limits.dtype).eps)
@@ -305,4 +305,4 @@ def _search_tree(index, queries, wanted, near, k, reach) -> _Near:
     n = index.points.shape[0]
     items = jnp.where(found.squares <= reach, jnp.minimum(found.items, n), n).T
     items = jnp.where(wanted[:, None], items, near.items)
-    return _Near(items, near.limits, near.certain | wanted)
+    return Near(items, near.limits, near.certain | wanted)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._backends import AbstractBackend, AbstractIndex, usable
 from ._brute import BruteForce
-from ._cells import CellIndex, CellList
+from ._cells import CellIndex, CellList, Near, search_in_tree
 from ._tree import Nearest, insert
 
 # The grid reaches beyond the points by this share of their extent.
@@ -48,34 +48,16 @@ class ListIndex(AbstractIndex):
     def search(self, queries, active, k, reach):
         if k > min(_MANY, self.items.shape[1]):
             return self.rest.search(queries, active, k, reach)
-        found, certain = self.from_lists(queries, k, reach)
-        doubtful = active & ~certain
+        near = self.from_lists(queries, k, reach)
+        doubtful = active & ~near.certain
         count = jnp.sum(doubtful)
-        ways = (self._as_found, self._with_few_again, self._with_many_again)
+        ways = (_as_found, _with_few_again, _with_many_again)
         way = jnp.where(count > min(_FEW, queries.shape[0]), 2, jnp.minimum(count, 1))
-        again = [lambda *args, f=f: f(*args, k, reach) for f in ways]
-        return jax.lax.switch(way, again, queries, doubtful, found)
+        again = [lambda *args, f=f: f(self, *args, k, reach) for f in ways]
+        return jax.lax.switch(way, again, queries, doubtful, near)
 
-    def _as_found(self, queries, doubtful, found, k, reach):
-        return found
-
-    def _with_few_again(self, queries, doubtful, found, k, reach):
-        """The doubtful rows compared with every point: a walk costs more for so few."""
-        rows = jnp.nonzero(doubtful, size=_FEW, fill_value=queries.shape[0])[0]
-        few = queries.at[rows].get(mode="fill", fill_value=0)
-        items = (
-            BruteForce(_FEW)
-            .build(self.points, self.mask)
-            .search(few, rows < queries.shape[0], k, reach)
-        )
-        return found.at[rows].set(items, mode="drop")
-
-    def _with_many_again(self, queries, doubtful, found, k, reach):
-        items = self.rest.search(queries, doubtful, k, reach)
-        return jnp.where(doubtful[:, None], items, found)
-
-    def from_lists(self, queries, k, reach):
-        """The k nearest of the candidates, and which rows are certainly right."""
+    def from_lists(self, queries, k, reach) -> Near:
+        """The k nearest of the candidates."""
         n, m = self.points.shape[0], self.items.shape[1]
         cell = jnp.floor((queries - self.low) / self.width)
         cell = jnp.clip(cell, 0, (self.counts - 1).astype(cell.dtype))
@@ -96,10 +78,30 @@ class ListIndex(AbstractIndex):
         there = (best.squares <= reach) & (best.squares < jnp.inf)
         found = jnp.where(there, self.items[row, best.items], n).T
         away = jnp.sqrt(jnp.sum((queries - center) ** 2, axis=1))
-        need = jnp.sqrt(jnp.minimum(best.squares[-1], reach))
+        limits = jnp.minimum(best.squares[-1], reach)
         size = jnp.max(jnp.abs(queries), axis=1) + jnp.max(jnp.abs(self.low))
         rounding = 32 * jnp.finfo(queries.dtype).eps * size
-        return found, need + away + rounding < entry[-1]
+        certain = jnp.sqrt(limits) + away + rounding < entry[-1]
+        return Near(found, limits, certain)
+
+
+def _as_found(index, queries, doubtful, near, k, reach):
+    return near.items
+
+
+def _with_few_again(index, queries, doubtful, near, k, reach):
+    """The doubtful rows compared with every point: a walk costs more for so few."""
+    q = queries.shape[0]
+    rows = jnp.nonzero(doubtful, size=_FEW, fill_value=q)[0]
+    few = queries.at[rows].get(mode="fill", fill_value=0)
+    every = BruteForce(_FEW).build(index.points, index.mask)
+    items = every.search(few, rows < q, k, reach)
+    return near.items.at[rows].set(items, mode="drop")
+
+
+def _with_many_again(index, queries, doubtful, near, k, reach):
+    """The doubtful rows searched in the tree."""
+    return search_in_tree(index.rest, queries, doubtful, near, k, reach).items
 
 
 class CandidateLists(AbstractBackend):

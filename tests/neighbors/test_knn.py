@@ -82,11 +82,13 @@ def test_lists_decide_most_queries_near_the_points():
     points = jnp.asarray(CLOUDS["surface"][0], jnp.float32)
     index = build(points, backend=CandidateLists())
     beside = points + 0.02 * np.random.default_rng(3).normal(size=(N, 3))
-    certain = index.from_lists(beside.astype(jnp.float32), 2, jnp.float32(jnp.inf))[1]
+    certain = index.from_lists(
+        beside.astype(jnp.float32), 2, jnp.float32(jnp.inf)
+    ).certain
     assert certain.mean() > 0.9
     # Far away only the gate decides: nothing can be within it.
     far = points[:Q] + 100
-    assert not index.from_lists(far, 2, jnp.float32(jnp.inf))[1].any()
+    assert not index.from_lists(far, 2, jnp.float32(jnp.inf)).certain.any()
 
 
 @pytest.mark.slow
