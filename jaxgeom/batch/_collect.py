@@ -8,6 +8,7 @@ from collections import Counter
 from ._states import STATES, states
 
 _COLUMNS = ("id", "status", "code", "message", "fitness", "rmse", "seconds")
+_MESH = ("mesh", "vertices", "faces", "watertight")
 _MATRIX = tuple(f"t{i}{j}" for i in range(4) for j in range(4))
 
 
@@ -22,17 +23,21 @@ def count(out) -> dict[str, int]:
 
 
 def collect(out, table) -> int:
-    """Write one CSV row per scan, the 4 x 4 matrix in t00 ... t33; how many rows."""
+    """Write one CSV row per scan, the 4 x 4 matrix in t00 ... t33; how many rows.
+
+    Columns of a mesh are empty where there is none.
+    """
     table = pathlib.Path(table)
     partial = table.with_name(table.name + ".tmp")
     rows = 0
     with open(partial, "w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow((*_COLUMNS, *_MATRIX))
+        writer.writerow((*_COLUMNS, *_MATRIX, *_MESH))
         for state in states(out):
             matrix = state["transform"] or [[""] * 4] * 4
             flat = [x for row in matrix for x in row]
-            writer.writerow([*(state[name] for name in _COLUMNS), *flat])
+            mesh = (state.get(name) for name in _MESH)
+            writer.writerow([*(state[name] for name in _COLUMNS), *flat, *mesh])
             rows += 1
     os.replace(partial, table)
     return rows

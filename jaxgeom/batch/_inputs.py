@@ -35,12 +35,9 @@ class Points(eqx.Module):
 
 def read_points(url: str, what: str) -> Points:
     """The points of a plain path, a file:// URL, or any URL that fsspec knows."""
-    try:
-        with local_file(url) as path:
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            cloud = load_cloud(path)
-    except (FileError, OSError) as error:
-        raise Refused(f"{what}_unreadable", str(error)) from None
+    with readable(url, what) as path:
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        cloud = load_cloud(path)
     points = np.asarray(cloud.points, np.float64)
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < _FEWEST:
@@ -53,6 +50,22 @@ def read_points(url: str, what: str) -> Points:
         text = message(must, f"{len(points)} equal points", "Check the file.")
         raise Refused(f"{what}_degenerate", text)
     return Points(points, digest)
+
+
+@contextlib.contextmanager
+def readable(url: str, what: str):
+    """The path of a file while it is read; errors refuse the scan."""
+    try:
+        with local_file(url) as path:
+            yield path
+    except (FileError, OSError) as error:
+        raise Refused(f"{what}_unreadable", str(error)) from None
+
+
+def source_digest(url: str) -> str:
+    """The hash of the bytes of a scan. Raises `Refused`."""
+    with readable(url, "source") as path:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def digest_of(url: str) -> str:

@@ -17,7 +17,8 @@ _KEYS = {"id", "source", "target", "init", "parameters"}
 
 
 class Scan(eqx.Module):
-    """One line of a manifest: lay `source` on `target`.
+    """One line of a manifest: lay `source` on `target`, or reconstruct it if that is
+    None.
 
     `init` is None, "mean", the place of a text file with a 4 x 4 matrix, or 4 rows of
     4 numbers; `voxel_size` is None for that of the run.
@@ -25,7 +26,7 @@ class Scan(eqx.Module):
 
     id: str = eqx.field(static=True)
     source: str = eqx.field(static=True)
-    target: str = eqx.field(static=True)
+    target: str | None = eqx.field(static=True, default=None)
     init: str | tuple | None = eqx.field(static=True, default=None)
     voxel_size: float | None = eqx.field(static=True, default=None)
 
@@ -37,7 +38,8 @@ def read_manifest(path) -> Iterator[Scan]:
 
     - `path`: a `.jsonl` file of objects, or a CSV file with a header. Columns: `id`
       (letters, digits, dot, dash, underscore: it names the status file), `source`,
-      `target`, and if wanted `init` and `parameters` (an object with `voxel_size`).
+      `target` (without one the scan is reconstructed), and if wanted, beside a target,
+      `init` and `parameters` (an object with `voxel_size`).
 
     Raises `GeometryError` naming the line that is not as it must be, and `FileError`
     for a file that is not text.
@@ -82,9 +84,13 @@ def _json(text, place):
 def _scan(row, place) -> Scan:
     if not isinstance(row, dict) or not set(row) <= _KEYS:
         raise _bad(place, repr(row)[:200])
-    for key in ("id", "source", "target"):
+    for key in ("id", "source"):
         if not isinstance(row.get(key), str):
             raise _bad(place, f"{key} {row.get(key)!r}")
+    if not isinstance(row.get("target"), str | None):
+        raise _bad(place, f"target {row['target']!r}")
+    if row.get("target") is None and {"init", "parameters"} & set(row):
+        raise _bad(place, "init or parameters without a target")
     if not _NAME.fullmatch(row["id"]):
         raise _bad(place, f"id {row['id']!r}")
     size = _voxel_size(row.get("parameters") or {}, place)
@@ -93,7 +99,7 @@ def _scan(row, place) -> Scan:
         init = tuple(tuple(r) if isinstance(r, list) else r for r in init)
     elif init is not None and not isinstance(init, str):
         raise _bad(place, f"init {init!r}")
-    return Scan(row["id"], row["source"], row["target"], init, size)
+    return Scan(row["id"], row["source"], row.get("target"), init, size)
 
 
 def _voxel_size(parameters, place):
@@ -110,7 +116,7 @@ def _voxel_size(parameters, place):
 
 def _bad(place, given):
     must = (
-        "a line must hold id (letters, digits, '.', '-', '_'), source, target, and at "
-        "most init and parameters {voxel_size}"
+        "a line must hold id (letters, digits, '.', '-', '_') and source, and may hold "
+        "target, and with it init and parameters {voxel_size}"
     )
     return GeometryError(message(f"{place}: {must}", given, "Correct the manifest."))

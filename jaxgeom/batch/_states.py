@@ -13,14 +13,14 @@ _FIELDS = {
 }
 
 
+def place_of(kind: str, name: str, ending: str) -> pathlib.Path:
+    """Where a file of a scan lies in the folder: 256 folders keep each one small."""
+    return pathlib.Path(kind, f"{zlib.crc32(name.encode()) % 256:02x}", name + ending)
+
+
 def state_path(out, name: str) -> pathlib.Path:
-    """Where the state of a scan lies: 256 folders keep each one small."""
-    return (
-        pathlib.Path(out)
-        / "status"
-        / f"{zlib.crc32(name.encode()) % 256:02x}"
-        / (f"{name}.json")
-    )
+    """Where the state of a scan lies."""
+    return pathlib.Path(out) / place_of("status", name, ".json")
 
 
 def write_state(out, state: dict) -> None:

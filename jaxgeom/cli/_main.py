@@ -4,6 +4,7 @@ This file imports neither JAX nor trimesh, so that help and usage errors are imm
 """
 
 import argparse
+import contextlib
 import importlib
 import os
 import sys
@@ -14,7 +15,7 @@ from . import _values as values
 OK, INTERNAL, USAGE, FILE, DATA, CHECK, SOME, INTERRUPTED = 0, 1, 2, 3, 4, 5, 6, 130
 
 # Commands whose work is divided among devices.
-_BATCHES = ("batch", "register_many")
+_BATCHES = ("batch", "register_many", "warmup")
 _EPILOG = """exit codes: 0 ok, 1 internal error, 2 usage, 3 file, 4 bad data,
 5 the result failed its own check, 6 some scans of a batch failed, 130 interrupted"""
 
@@ -61,7 +62,9 @@ def _use_every_core():
         # Not every system tells which cores this process may use.
         own = getattr(os, "sched_getaffinity", None)
         count = len(own(0)) if own else os.cpu_count()
-        jax.config.update("jax_num_cpu_devices", count)
+        # A process that has computed already keeps its devices.
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", count)
 
 
 def _use_compile_cache():
@@ -191,16 +194,32 @@ def _add_register_many(commands):
 
 def _add_batch(commands):
     command = commands.add_parser(
-        "batch", help="register every line of a manifest; a rerun goes on"
+        "batch", help="register or reconstruct every line of a manifest; reruns go on"
     )
-    command.add_argument(
-        "manifest", metavar="MANIFEST", help="CSV or JSONL: id, source, target, init"
-    )
+    _add_manifest(command)
     command.add_argument("--out", required=True, metavar="DIR", help="folder of states")
     command.add_argument(
         "--shard", metavar="I/N", help="from 0/N (default: of the array job, or all)"
     )
     command.add_argument("--retry-failed", action="store_true")
+    command = commands.add_parser(
+        "warmup", help="compile what a batch will need into the cache"
+    )
+    _add_manifest(command)
+    status = commands.add_parser("batch-status", help="how the scans of a batch ended")
+    status.add_argument("out", metavar="DIR")
+    table = commands.add_parser("batch-collect", help="one CSV table of a batch")
+    table.add_argument("out", metavar="DIR")
+    table.add_argument("-o", "--output", required=True, metavar="CSV")
+
+
+def _add_manifest(command):
+    """The manifest, and the options for its lines."""
+    command.add_argument(
+        "manifest",
+        metavar="MANIFEST",
+        help="CSV or JSONL: id, source, target, init; no target: reconstruct",
+    )
     command.add_argument(
         "--chunk",
         type=values.chunk,
@@ -208,12 +227,20 @@ def _add_batch(commands):
         metavar="B",
         help="scans in one call (64)",
     )
+    command.add_argument(
+        "--resolution",
+        type=values.resolution,
+        default=64,
+        metavar="N",
+        help="nodes of the grid of a scan without a target (64)",
+    )
+    command.add_argument(
+        "--point-weight",
+        type=values.nonnegative,
+        metavar="W",
+        help="as in reconstruct, for a scan without a target",
+    )
     _add_alignment(command)
-    status = commands.add_parser("batch-status", help="how the scans of a batch ended")
-    status.add_argument("out", metavar="DIR")
-    table = commands.add_parser("batch-collect", help="one CSV table of a batch")
-    table.add_argument("out", metavar="DIR")
-    table.add_argument("-o", "--output", required=True, metavar="CSV")
 
 
 def _add_alignment(command):

@@ -10,11 +10,21 @@ import time
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from jaxgeom import GeometryError, Rigid, register
-from jaxgeom.batch import Shard, read_manifest, shard_of, shard_of_environment
+from jaxgeom.batch import (
+    Registering,
+    Shard,
+    read_manifest,
+    run_batch,
+    shard_of,
+    shard_of_environment,
+    warm_up,
+)
 from jaxgeom.cli import main
-from jaxgeom.pipelines import choose_voxel_size
+from jaxgeom.io import load_mesh
+from jaxgeom.pipelines import Pyramid, _register_many, choose_voxel_size
 
 _BAD = {
     "gone": "source_unreadable",
@@ -150,7 +160,11 @@ def test_manifests_of_both_forms_and_their_errors(tmp_path):
     path.write_text(json.dumps(good) + "\n\n")
     (scan,) = read_manifest(path)
     assert (scan.id, scan.voxel_size, scan.init) == ("a", 2.0, None)
+    path.write_text(json.dumps({"id": "b", "source": "x"}))
+    assert next(read_manifest(path)).target is None
     wrong = [
+        {"id": "a", "source": "x", "init": "mean"},
+        {**good, "target": 3},
         {**good, "id": "../a"},
         {**good, "source": 3},
         {**good, "colour": 1},
@@ -179,6 +193,58 @@ def _driver(manifest, out, *more, before=""):
         text=True,
         env={**os.environ, "XDG_CACHE_HOME": os.path.dirname(manifest)},
     )
+
+
+def test_scans_without_a_target_are_reconstructed(tmp_path, capsys):
+    """Bad ones fail alone; meshes lie where the states say, and near the scans."""
+    scans = {f"m{i}": _lumps(210 + 20 * i, i) for i in range(3)}
+    scans["line"] = np.linspace(0, 1, 90)[:, None] * np.ones(3)
+    scans["few"] = scans["m0"][:3]
+    for name, points in scans.items():
+        np.save(tmp_path / f"{name}.npy", points)
+    (tmp_path / "gone.ply").write_bytes(b"ply")
+    rows = [(name, tmp_path / f"{name}.npy", "") for name in scans]
+    rows += [("gone", tmp_path / "gone.ply", "")]
+    manifest, out = _write(tmp_path, rows), tmp_path / "out"
+    command = ["batch", manifest, "--out", str(out), "--chunk", "8"]
+    command += ["--resolution", "24"]
+    assert main(command) == 6
+    assert capsys.readouterr().out == "3 ok, 0 warning, 3 failed, 0 skipped\n"
+    found = _states(out)
+    codes = {name: found[name]["code"] for name in ("line", "few", "gone")}
+    assert list(codes.values()) == [
+        *("degenerate_input", "too_few_points", "source_unreadable")
+    ]
+    assert all(len(found[name]["message"]) > 20 for name in codes)
+    for i in range(3):
+        state = found[f"m{i}"]
+        mesh = load_mesh(out / state["mesh"])
+        assert state["watertight"] and state["faces"] == len(mesh.faces)
+        gaps = cKDTree(mesh.vertices).query(scans[f"m{i}"])[0]
+        assert gaps.max() < 0.15
+    assert not list(out.rglob(".*"))
+    assert main(command) == 6
+    assert capsys.readouterr().out == "3 ok, 0 warning, 3 failed, 6 skipped\n"
+    table = tmp_path / "table.csv"
+    assert main(["batch-collect", str(out), "-o", str(table)]) == 0
+    row = next(row for row in csv.DictReader(table.open()) if row["id"] == "m2")
+    assert (out / row["mesh"]).exists() and row["watertight"] == "True"
+
+
+@pytest.mark.slow
+def test_a_warm_batch_compiles_nothing(work, tmp_path, monkeypatch, capsys):
+    """The programs that `warm_up` counts are all that a batch needs."""
+    _, manifest = work
+    said, traces, align = [], [], _register_many.align_to
+    counted = lambda *args: (traces.append(1), align(*args))[1]
+    monkeypatch.setattr(_register_many, "align_to", counted)
+    assert warm_up(manifest, chunk=4, tell=said.append) == len(said) == 1
+    first = len(traces)
+    assert first >= 1 and "up to 256 points, 4 at once" in said[0]
+    tally = run_batch(manifest, tmp_path / "out", chunk=4)
+    assert tally["ok"] == 6 and len(traces) == first
+    assert main(["warmup", manifest, "--chunk", "4"]) == 0
+    assert "1 programs are in the cache" in capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -255,8 +321,9 @@ def test_a_batch_equals_register(work, tmp_path):
 @pytest.mark.slow
 def test_what_did_not_settle_is_a_warning(work, tmp_path):
     _, manifest = work
-    out, size = tmp_path / "out", ["--voxel-size", "0.15"]
-    assert main(["batch", manifest, "--out", str(out), "--chunk", "8", *size]) == 6
+    out = tmp_path / "out"
+    hasty = Registering(lambda target: {"pyramid": Pyramid(max_steps=3)})
+    assert run_batch(manifest, out, registering=hasty, chunk=8)["warning"] > 0
     state = _states(out)["s0"]
     assert (state["status"], state["code"]) == ("warning", "not_converged")
     assert "stopped before" in state["message"]

@@ -119,6 +119,7 @@ def _agree(scans):
     return names
 
 
+@pytest.mark.slow
 def test_statuses_and_notes_are_those_of_each_alone():
     names = _agree(_odd())
     assert names[:3] == ["degenerate_input", "zero_normals", "zero_normals"]
