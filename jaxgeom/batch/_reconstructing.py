@@ -10,6 +10,7 @@ import numpy as np
 
 from ..io import load_cloud, save_mesh
 from ..meshes import topology
+from ..normals import LocalPlanes
 from ..pipelines import reconstruct_many
 from ..reconstruction import Poisson, ScreenedPoisson
 from ..shapes import PointCloud, stack
@@ -37,6 +38,7 @@ class Reconstructing(AbstractTask):
     - `resolution`, `padding`, `min_component`: those of `reconstruct`.
     - `screening`: the weight of the samples; None for that of the noise, 0 for plain
       Poisson.
+    - `orientation_points`: the `capacity` of `LocalPlanes`, for scans without normals.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class Reconstructing(AbstractTask):
         screening: float | None = None,
         padding: float = 0.1,
         min_component: float = 0.01,
+        orientation_points: int = 4096,
     ):
         method = Poisson() if screening == 0 else ScreenedPoisson(screening=screening)
         self.settings = {
@@ -52,8 +55,13 @@ class Reconstructing(AbstractTask):
             "padding": padding,
             "min_component": min_component,
         }
-        self.choices = {**self.settings, "screening": screening}
+        self.choices = {
+            **self.settings,
+            "screening": screening,
+            "orientation_points": orientation_points,
+        }
         self.settings["method"] = method
+        self.settings["orientation"] = LocalPlanes(capacity=orientation_points)
 
     def input_hash(self, scan):
         return hash_of(source_digest(scan.source), "", self.choices)

@@ -24,7 +24,11 @@ def tasks(arguments) -> dict:
     """How lines of each kind are worked on."""
     choices = {name: getattr(arguments, name) for name in _CHOICES}
     registering = Registering(lambda target: settings(arguments, target), choices)
-    reconstructing = Reconstructing(arguments.resolution, arguments.point_weight)
+    reconstructing = Reconstructing(
+        arguments.resolution,
+        arguments.point_weight,
+        orientation_points=arguments.orientation_points,
+    )
     return {"registering": registering, "reconstructing": reconstructing}
 
 

@@ -240,6 +240,13 @@ def _add_manifest(command):
         metavar="W",
         help="as in reconstruct, for a scan without a target",
     )
+    command.add_argument(
+        "--orientation-points",
+        type=values.chunk,
+        default=4096,
+        metavar="N",
+        help="that decide the sides of a scan without normals (4096; time ~ N^2)",
+    )
     _add_alignment(command)
 
 

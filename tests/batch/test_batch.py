@@ -207,7 +207,7 @@ def test_scans_without_a_target_are_reconstructed(tmp_path, capsys):
     rows += [("gone", tmp_path / "gone.ply", "")]
     manifest, out = _write(tmp_path, rows), tmp_path / "out"
     command = ["batch", manifest, "--out", str(out), "--chunk", "8"]
-    command += ["--resolution", "24"]
+    command += ["--resolution", "24", "--orientation-points", "128"]
     assert main(command) == 6
     assert capsys.readouterr().out == "3 ok, 0 warning, 3 failed, 0 skipped\n"
     found = _states(out)
