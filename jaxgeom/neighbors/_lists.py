@@ -3,7 +3,8 @@
 Every cell of a grid lists the points nearest to its center x, c_1 to c_m. A point that
 is not in the list is at least |x - c_m| from x, and so at least |x - c_m| - |q - x|
 from a query q of that cell (triangle inequality). Neighbors from the list that are
-nearer than this are certainly right; the other queries are searched in cells and tree.
+nearer than this are certainly right; the other queries are compared with all points
+where they are few, and searched in a tree.
 """
 
 import equinox as eqx
@@ -141,13 +142,14 @@ class CandidateLists(AbstractBackend):
 def _grid(low, high, cells):
     """The lower corner, the width and the numbers of at most `cells` cubes."""
     side = jnp.max(high - low)
-    margin = jnp.where(side > 0, _MARGIN * side, 0.5)
-    low, extent = low - margin, high - low + 2 * margin
+    side = jnp.where(side > 0, side, 1)
+    # In units of the side, whose third power need not be a number.
+    extent = (high - low) / side + 2 * _MARGIN
     counts = lambda width: jnp.ceil(extent / width)
     start = jnp.cbrt(jnp.prod(extent) / cells)
     over = lambda width: jnp.prod(counts(width)) > cells
     width = jax.lax.while_loop(over, lambda width: 1.05 * width, start)
-    return low, width, counts(width).astype(jnp.int32)
+    return low - _MARGIN * side, width * side, counts(width).astype(jnp.int32)
 
 
 def _row(cell, counts):

@@ -78,6 +78,14 @@ def test_lists_equal_a_tree(name):
         _assert_exact(points, asked, 2, find(asked))
 
 
+@pytest.mark.parametrize("scale", [1e-15, 1e15])
+def test_lists_of_tiny_and_huge_shapes(scale):
+    """The cube of their extent is no number in single precision."""
+    points = jnp.asarray(scale * CLOUDS["surface"][0][:300], jnp.float32)
+    found = knn(build(points, backend=CandidateLists()), points, 1)
+    assert (found.indices[:, 0] == jnp.arange(300)).all()
+
+
 def test_lists_decide_most_queries_near_the_points():
     points = jnp.asarray(CLOUDS["surface"][0], jnp.float32)
     index = build(points, backend=CandidateLists())
