@@ -70,6 +70,7 @@ def sees_three_planes(body, values, grid, corner):
 field_at = jax.jit(lambda body, points: jax.vmap(body)(points))
 
 
+@pytest.mark.slow
 def test_corners_and_edges_of_turned_boxes(tools):
     """A corner of which the edges of a cell see all planes is met to 1/1000 cell."""
     grid, seen = box_grid(), 0

@@ -38,9 +38,9 @@ def body_grid(shape, dtype=np.float32):
     return Grid(low.astype(dtype), spacing.astype(dtype), shape)
 
 
-# Capacities are programs: most fields are left to the slow run.
+# Capacities are programs, which take long to compile.
 FIELDS = [
-    ("noise", (noise(0),)),
+    pytest.param("noise", (noise(0),), marks=pytest.mark.slow),
     pytest.param("all", (noise(1), ties(0), ties(1), sheets()), marks=pytest.mark.slow),
 ]
 

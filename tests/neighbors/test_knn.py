@@ -65,7 +65,12 @@ def test_equals_a_tree(name, backend):
     _assert_exact(points, queries, 5, find(points, queries))
 
 
-@pytest.mark.parametrize("name", CLOUDS)
+# Every cloud makes a program of its own.
+_SOME = ("clusters", "duplicates", "far queries")
+_REST = [pytest.param(x, marks=pytest.mark.slow) for x in CLOUDS if x not in _SOME]
+
+
+@pytest.mark.parametrize("name", [*_SOME, *_REST])
 def test_lists_equal_a_tree(name):
     """On the points, a little beside them (a few rows in doubt), and elsewhere."""
     points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS[name])
@@ -78,7 +83,7 @@ def test_lists_equal_a_tree(name):
         _assert_exact(points, asked, 2, find(asked))
 
 
-@pytest.mark.parametrize("scale", [1e-15, 1e15])
+@pytest.mark.parametrize("scale", [1e-15, pytest.param(1e15, marks=pytest.mark.slow)])
 def test_lists_of_tiny_and_huge_shapes(scale):
     """The cube of their extent is no number in single precision."""
     points = jnp.asarray(scale * CLOUDS["surface"][0][:300], jnp.float32)

@@ -126,7 +126,7 @@ MORE_SOLVERS = [
 SOLVERS += [pytest.param(m, marks=pytest.mark.slow) for m in MORE_SOLVERS]
 
 
-@pytest.mark.parametrize("seed", [11, 12, 18])
+@pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.slow)])
 def test_pairs_that_alternate_end_the_search(seed):
     """Noise makes these searches go round for ever; all poses of the round will do."""
     points, normals = _surface(N, seed)
@@ -136,7 +136,7 @@ def test_pairs_that_alternate_end_the_search(seed):
     found = align(source, target, method=method)
     assert found.result == RESULTS.successful and found.num_steps < 20
     # Without a tolerance it goes on, and never comes to rest nor gets anywhere.
-    long = align(source, target, method=method, rtol=jnp.float32(-1), max_steps=200)
+    long = align(source, target, method=method, rtol=jnp.float32(-1))
     assert long.result == RESULTS.not_converged
     assert _off(found, Rigid.log(long.target_from_source)) < 1e-3
 

@@ -98,6 +98,7 @@ def test_joint_poses_are_exact_for_one_surface(views):
     assert float(out.rmse) < 0.01
 
 
+@pytest.mark.slow
 def test_padding_and_order_do_not_change_the_poses(views):
     clouds, truth = views
     start = jax.vmap(lambda a, b: a @ b)(_turns(4, 3, 0.02), truth)
