@@ -157,6 +157,7 @@ def _parts(transform):
 
 
 def as_dtype(transform, dtype):
+    """The transform with numbers of another precision, on the host."""
     return jax.tree.map(lambda x: np.asarray(x).astype(dtype), transform)
 
 
