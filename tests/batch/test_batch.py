@@ -195,6 +195,7 @@ def _driver(manifest, out, *more, before=""):
     )
 
 
+@pytest.mark.slow
 def test_scans_without_a_target_are_reconstructed(tmp_path, capsys):
     """Bad ones fail alone; meshes lie where the states say, and near the scans."""
     scans = {f"m{i}": _lumps(210 + 20 * i, i) for i in range(3)}

@@ -158,6 +158,7 @@ def _bumpy(dtype):
     return TriangleMesh(jnp.asarray(v, dtype), jnp.asarray(peer.faces[:-30]))
 
 
+@pytest.mark.slow
 def test_hierarchical_winding_converges_to_the_exact_one():
     mesh = _bumpy(np.float32)
     rng = np.random.default_rng(3)

@@ -109,6 +109,7 @@ def test_padding_and_order_do_not_change_the_poses(views):
     assert angle.max() < 2e-4 and distance.max() < 2e-4
 
 
+@pytest.mark.slow
 def test_a_scan_far_from_all_others_is_a_status(views):
     clouds, truth = views
     away = truth.translation.at[2].add(50.0)
