@@ -22,8 +22,8 @@ import jax
 import numpy as np
 
 from experiments.registration import speed
-from experiments.scale.throughput import LARGEST, NOISE, NUMBERS, SMALLEST, flask
-from experiments.scale.throughput import surface as sampled
+from experiments.scale import throughput
+from experiments.scale.throughput import flask, rate_of
 from jaxgeom import reconstruct
 from jaxgeom.batch import Reconstructing, run_batch
 from jaxgeom.io import load_mesh
@@ -35,14 +35,16 @@ def make(folder, scans):
     """Scans, manifest and the numbers of the flasks."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(2)
-    numbers = rng.uniform(-1, 1, (scans, NUMBERS)).astype(np.float32)
+    numbers = rng.uniform(-1, 1, (scans, throughput.NUMBERS)).astype(np.float32)
     with open(folder / "manifest.csv", "w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow(["id", "source"])
         for i, u in enumerate(numbers):
-            points, _, found = map(np.asarray, sampled(u, jax.random.key(i)))
-            scan = points[found][: rng.integers(SMALLEST, LARGEST)]
-            scan = scan + NOISE * HEIGHT * rng.normal(size=scan.shape)
+            points, _, found = map(np.asarray, throughput.surface(u, jax.random.key(i)))
+            scan = points[found][
+                : rng.integers(throughput.SMALLEST, throughput.LARGEST)
+            ]
+            scan = scan + throughput.NOISE * HEIGHT * rng.normal(size=scan.shape)
             np.save(folder / f"{i}.npy", scan.astype(np.float32))
             rows.writerow([i, folder / f"{i}.npy"])
     np.save(folder / "numbers.npy", numbers)
@@ -65,22 +67,15 @@ def batched(folder, resolution):
     """Scans a second after the first chunk of each size, and the states."""
     marks, start = [], time.perf_counter()
     tell = lambda text: marks.append((time.perf_counter() - start, text))
-    how = Reconstructing(resolution)
+    how = Reconstructing({"resolution": resolution}, {"resolution": resolution})
     out = folder / "out"
     rest = {"reconstructing": how, "chunk": CHUNK, "tell": tell}
     tally = run_batch(folder / "manifest.csv", out, **rest)
     total = time.perf_counter() - start
-    marks = [m for m in marks if " at once" in m[1]]
-    seen, work, count = set(), 0.0, 0
-    for (begin, text), stop in zip(
-        marks, [*(m[0] for m in marks[1:]), total], strict=True
-    ):
-        number, kind = text.split(" scans ")
-        if kind in seen:
-            work, count = work + stop - begin, count + int(number)
-        seen.add(kind)
-    print(f"run_batch, {CHUNK} at once: {tally}, {total:.0f} s, {len(seen)} sizes")
-    return count / work, [json.loads(p.read_text()) for p in out.rglob("*/*/*.json")]
+    chunks = [mark for mark in marks if " at once" in mark[1]]
+    rate, sizes, _ = rate_of(chunks, total)
+    print(f"run_batch, {CHUNK} at once: {tally}, {total:.0f} s, {sizes} sizes")
+    return rate, [json.loads(p.read_text()) for p in out.rglob("*/*/*.json")]
 
 
 def by_open3d(points, depth):

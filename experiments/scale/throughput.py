@@ -118,6 +118,21 @@ def ours(folder):
     print(json.dumps({**facts, "seconds": time.perf_counter() - start, "mib": used()}))
 
 
+def rate_of(chunks, end):
+    """Scans a second after the first chunk of each size, how many sizes there were, and
+    the seconds of those first chunks; `chunks` are when each began, and its line."""
+    seen, compiling, work, count = set(), 0.0, 0.0, 0
+    stops = [*(chunk[0] for chunk in chunks[1:]), end]
+    for (begin, text, *_), stop in zip(chunks, stops, strict=True):
+        number, kind = text.split(" scans ")
+        if kind in seen:
+            work, count = work + stop - begin, count + int(number)
+        else:
+            compiling += stop - begin
+            seen.add(kind)
+    return count / work, len(seen), compiling
+
+
 def show_ours(folder, truth):
     """Run ours in a process of its own, and say what it did."""
     command = [sys.executable, "-m", "experiments.scale.throughput"]
@@ -126,24 +141,16 @@ def show_ours(folder, truth):
     facts = json.loads(done.stdout.splitlines()[-1])
     print(f"ours: {facts['tally']} in {facts['seconds']:.1f} s, {facts['mib']:.0f} MiB")
     chunks = [m for m in facts["marks"] if " at once" in m[1]]
-    ends = [m[0] for m in chunks[1:]] + [facts["seconds"]]
-    seen, compiling, work, count = set(), 0.0, 0.0, 0
-    for (begin, text, _), stop in zip(chunks, ends, strict=True):
-        number, kind = text.split(" scans ")
-        if kind in seen:
-            work, count = work + stop - begin, count + int(number)
-        else:
-            compiling += stop - begin
-            seen.add(kind)
-    print(f"  {len(seen)} programs, their first calls {compiling:.1f} s")
-    print(f"  {count / work:.0f} scans a second after that")
+    rate, programs, compiling = rate_of(chunks, facts["seconds"])
+    print(f"  {programs} programs, their first calls {compiling:.1f} s")
+    print(f"  {rate:.0f} scans a second after that")
     tenths = [m[2] for m in chunks[:: max(1, len(chunks) // 10)]]
     print(f"  MiB: {facts['before']:.0f} before,", *(f"{x:.0f}" for x in tenths))
     states = (json.loads(p.read_text()) for p in (folder / "out").rglob("*/*/*.json"))
     table = {int(s["id"]): s["transform"] for s in states if s["transform"]}
     ids = sorted(table)
     print("  " + told([table[i] for i in ids], truth[ids]), flush=True)
-    return count / work
+    return rate
 
 
 def by_gicp(kind, template):

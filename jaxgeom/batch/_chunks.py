@@ -16,11 +16,11 @@ class Chunks:
 
         Scans of a kind are a chunk when they are `most`.
         """
-        self.waiting.setdefault(key, []).append(work)
-        if len(self.waiting[key]) >= most:
+        self.waiting.setdefault(key, (most, []))[1].append(work)
+        if len(self.waiting[key][1]) == most:
             yield self._take(key)
         elif self._held() >= _HELD_CHUNKS * self.chunk:
-            yield self._take(max(self.waiting, key=lambda k: len(self.waiting[k])))
+            yield self._take(max(self.waiting, key=lambda k: len(self.waiting[k][1])))
 
     def rest(self):
         """All that waits, chunk by chunk."""
@@ -28,11 +28,11 @@ class Chunks:
             yield self._take(next(iter(self.waiting)))
 
     def _held(self):
-        return sum(len(works) for works in self.waiting.values())
+        return sum(len(works) for _, works in self.waiting.values())
 
     def _take(self, key):
-        works = self.waiting.pop(key)
-        few = min(self.chunk, 1 << (len(works) - 1).bit_length())
+        most, works = self.waiting.pop(key)
+        few = min(most, 1 << (len(works) - 1).bit_length())
         # A size that was compiled already is used again, though some of it is padding.
         kind = (type(key), key.size)
         room = max(few, self.rooms.get(kind, 0))

@@ -35,7 +35,7 @@ class Points(eqx.Module):
 
 def read_points(url: str, what: str) -> Points:
     """The points of a plain path, a file:// URL, or any URL that fsspec knows."""
-    with readable(url, what) as path:
+    with readable(url, f"{what}_unreadable") as path:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         cloud = load_cloud(path)
     points = np.asarray(cloud.points, np.float64)
@@ -53,24 +53,18 @@ def read_points(url: str, what: str) -> Points:
 
 
 @contextlib.contextmanager
-def readable(url: str, what: str):
-    """The path of a file while it is read; errors refuse the scan."""
+def readable(url: str, code: str):
+    """The path of a file while it is read; errors refuse the scan with the code."""
     try:
         with local_file(url) as path:
             yield path
-    except (FileError, OSError) as error:
-        raise Refused(f"{what}_unreadable", str(error)) from None
+    except (ValueError, OSError) as error:
+        raise Refused(code, str(error)) from None
 
 
-def source_digest(url: str) -> str:
-    """The hash of the bytes of a scan. Raises `Refused`."""
-    with readable(url, "source") as path:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def digest_of(url: str) -> str:
-    """The hash of the bytes of a file."""
-    with local_file(url) as path:
+def digest_of(url: str, code: str) -> str:
+    """The hash of the bytes of a file; what cannot be read is refused with the code."""
+    with readable(url, code) as path:
         return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -1,6 +1,7 @@
 """Lines with a target: the motion that lays the scan on it."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -9,10 +10,10 @@ import numpy as np
 
 from .._core import RESULTS, bucket
 from ..pipelines import register_many, share_target
-from ..shapes import PointCloud, stack
+from ..shapes import PointCloud
 from ..transforms import Rigid
-from ._inputs import Refused, digest_of, hash_of, read_points, source_digest, start_of
-from ._tasks import AbstractTask, Held, Outcome, finite, size_bucket, verdict
+from ._inputs import digest_of, hash_of, read_points, start_of
+from ._tasks import AbstractTask, Outcome, padded_batch, size_bucket, verdict
 
 _HELD_TARGETS = 4
 # A scan may need more voxels than the target; one that needs still more is done again.
@@ -47,17 +48,18 @@ class Registering(AbstractTask):
         choices: dict | None = None,
     ):
         self.settings, self.choices = settings, choices or {}
-        self.targets = Held(lambda url: read_points(url, "target"), _HELD_TARGETS)
-        self.shared = Held(self._share, _HELD_TARGETS)
+        held = functools.lru_cache(_HELD_TARGETS)
+        self._target = held(lambda url: read_points(url, "target"))
+        self._shared = held(self._share)
 
     def input_hash(self, scan):
-        target = self.targets[scan.target]
+        target = self._target(scan.target)
         given = _given_start(scan)
         told = {**self.choices, "own_voxel_size": scan.voxel_size, "init": given}
-        return hash_of(source_digest(scan.source), target.digest, told)
+        return hash_of(digest_of(scan.source, "source_unreadable"), target.digest, told)
 
     def read(self, scan):
-        target = self.targets[scan.target]
+        target = self._target(scan.target)
         source = read_points(scan.source, "source").points
         start = start_of(scan.init, source, target.points)
         key = _Key(scan.target, scan.voxel_size, size_bucket(len(source)))
@@ -67,21 +69,21 @@ class Registering(AbstractTask):
         return chunk
 
     def program(self, key):
-        shared = self.shared[key.target, key.voxel_size]
+        shared = self._shared(key.target, key.voxel_size)
         shapes = [level.target.prepared.target.points.shape for level in shared.levels]
         return (key.size, self._rooms(key), *shapes)
 
     def _rooms(self, key):
         """The capacity of every level: by the target and the bucket alone, so that
         neither programs nor results depend on which scans share a chunk."""
-        shared = self.shared[key.target, key.voxel_size]
+        shared = self._shared(key.target, key.voxel_size)
         return tuple(
             None if n is None else min(key.size, bucket(int(_MARGIN * n)))
-            for n in shared.rooms([self.targets[key.target].points])
+            for n in shared.rooms([self._target(key.target).points])
         )
 
     def solve(self, key, scans, works, room, out):
-        shared, rooms = self.shared[key.target, key.voxel_size], self._rooms(key)
+        shared, rooms = self._shared(key.target, key.voxel_size), self._rooms(key)
         full = tuple(key.size if share else None for share in shared.pyramid.voxels)
         align = lambda works, rooms: _aligned(works, shared, key.size, room, rooms)
         found = align(works, rooms)
@@ -92,9 +94,8 @@ class Registering(AbstractTask):
                 found[i] = item
         return [_outcome(item) for item in found]
 
-    def _share(self, kind):
-        url, voxel_size = kind
-        target = PointCloud(self.targets[url].points)
+    def _share(self, url, voxel_size):
+        target = PointCloud(self._target(url).points)
         chosen = dict(self.settings(target))
         if voxel_size is not None:
             chosen["voxel_size"] = voxel_size
@@ -105,21 +106,14 @@ def _given_start(scan):
     """What the start depends on: its file's bytes, or the text of the manifest."""
     if not isinstance(scan.init, str) or scan.init == "mean":
         return scan.init
-    try:
-        return digest_of(scan.init)
-    except (ValueError, OSError) as error:
-        raise Refused("bad_init", str(error)) from None
+    return digest_of(scan.init, "bad_init")
 
 
 def _aligned(works, shared, size, room, rooms):
     """One compiled call for `room` scans, those that are missing empty."""
-    missing = room - len(works)
-    clouds = [PointCloud(work.source) for work in works]
-    sources = stack(clouds + [PointCloud(np.zeros((1, 3)))] * missing, capacity=size)
-    mask = np.asarray(sources.mask) & (np.arange(room) < len(works))[:, None]
-    sources = eqx.tree_at(lambda c: c.mask, sources, mask)
+    sources = padded_batch([PointCloud(work.source) for work in works], room, size)
     starts = [work.start for work in works]
-    starts += [Rigid(np.eye(3), np.zeros(3))] * missing
+    starts += starts[:1] * (room - len(works))
     batched = jax.tree.map(lambda *rows: np.stack(rows), *starts)
     found = register_many(sources, shared, init=batched, rooms=rooms)
     found = jax.tree.map(np.asarray, found)
@@ -132,6 +126,8 @@ def _is_full(item):
 
 def _outcome(item) -> Outcome:
     matrix = np.asarray(item.target_from_source.matrix(), np.float64)
+    # JSON holds no numbers that are not finite.
+    finite = lambda x: float(x) if np.isfinite(x) else None
     facts = {
         "transform": matrix.tolist() if np.isfinite(matrix).all() else None,
         "fitness": finite(item.fitness),

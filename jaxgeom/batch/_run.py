@@ -1,5 +1,6 @@
 """The driver: read ahead, sort into kinds, work on chunks, write states."""
 
+import pathlib
 import platform
 import time
 from collections.abc import Callable
@@ -9,6 +10,7 @@ import jax
 
 from .. import __version__
 from .._core import GeometryError, message
+from ..io import FileError
 from ._chunks import Chunks
 from ._inputs import Refused
 from ._manifest import Scan, read_manifest
@@ -96,7 +98,7 @@ class _Run:
     """The state of a driver: what it holds, and what it has ended."""
 
     def __init__(self, out, task_of, retry_failed, chunk, tell):
-        self.out, self.task_of, self.chunk = out, task_of, chunk
+        self.out, self.task_of, self.chunk = pathlib.Path(out), task_of, chunk
         self.retry_failed, self.tell = retry_failed, tell
         self.chunks = Chunks(chunk)
         self.tally = {**dict.fromkeys(STATES, 0), "skipped": 0}
@@ -131,6 +133,8 @@ class _Run:
             return False
         if self.retry_failed and state["status"] == "failed":
             return False
+        if "mesh" in state and not (self.out / state["mesh"]).exists():
+            return False
         self.tally[state["status"]] += 1
         self.tally["skipped"] += 1
         return True
@@ -143,7 +147,7 @@ class _Run:
         self.tell(f"{len(works)} scans of up to {key.size} points, {room} at once")
         try:
             found = self.task_of(scans[0]).solve(key, scans, works, room, self.out)
-        except OSError:
+        except (OSError, FileError):
             # A disk that is full would fail every scan after this one.
             raise
         except Exception as error:

@@ -1,12 +1,13 @@
 """What is done with the scans of a batch, and how one ends."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Hashable
 
 import equinox as eqx
 import numpy as np
 
 from .._core import RESULTS, name_of
+from ..shapes import PointCloud, stack
 from ._manifest import Scan
 
 
@@ -20,7 +21,7 @@ class Outcome(eqx.Module):
     facts: dict = eqx.field(static=True, default_factory=dict)
 
 
-class AbstractTask:
+class AbstractTask(ABC):
     """A kind of work on scans; what it needs again, such as a target, it keeps."""
 
     @abstractmethod
@@ -50,19 +51,11 @@ class AbstractTask:
         """
 
 
-class Held:
-    """The last few of what takes long to make."""
-
-    def __init__(self, make, most: int):
-        self.make, self.most, self.items = make, most, {}
-
-    def __getitem__(self, key):
-        # Put last what is used, so that the first is what was not for longest.
-        item = self.items.pop(key) if key in self.items else self.make(key)
-        self.items[key] = item
-        while len(self.items) > self.most:
-            self.items.pop(next(iter(self.items)))
-        return item
+def padded_batch(clouds: list[PointCloud], room: int, size: int) -> PointCloud:
+    """A batch of `room` clouds of `size` points; those that are missing are empty."""
+    empty = np.zeros(len(clouds[0].points), bool)
+    empty = eqx.tree_at(lambda cloud: cloud.mask, clouds[0], empty)
+    return stack([*clouds, *[empty] * (room - len(clouds))], capacity=size)
 
 
 def size_bucket(n: int) -> int:
@@ -81,8 +74,3 @@ def verdict(result) -> Outcome:
     if code == "successful":
         return Outcome("ok", code)
     return Outcome("warning" if code == "not_converged" else "failed", code, text)
-
-
-def finite(x) -> float | None:
-    """A number as JSON can hold it: what is not finite becomes null."""
-    return float(x) if np.isfinite(x) else None

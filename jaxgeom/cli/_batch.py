@@ -10,26 +10,32 @@ from ..batch import (
     shard_of,
     shard_of_environment,
 )
+from ..normals import LocalPlanes
 from ._alignment import settings
 from ._main import OK, SOME
 from ._report import write_report
+from ._surface import method_of
 
-_CHOICES = (
+_ALIGNMENT = (
     *("objective", "kernel", "max_correspondence_distance", "voxel_size"),
     "with_scale",
 )
+_SURFACES = ("resolution", "point_weight", "orientation_points")
 
 
 def tasks(arguments) -> dict:
     """How lines of each kind are worked on."""
-    choices = {name: getattr(arguments, name) for name in _CHOICES}
-    registering = Registering(lambda target: settings(arguments, target), choices)
-    reconstructing = Reconstructing(
-        arguments.resolution,
-        arguments.point_weight,
-        orientation_points=arguments.orientation_points,
-    )
-    return {"registering": registering, "reconstructing": reconstructing}
+    chosen = lambda names: {name: getattr(arguments, name) for name in names}
+    aligned = lambda target: settings(arguments, target)
+    surfaces = {
+        "resolution": arguments.resolution,
+        "method": method_of(arguments.point_weight),
+        "orientation": LocalPlanes(capacity=arguments.orientation_points),
+    }
+    return {
+        "registering": Registering(aligned, chosen(_ALIGNMENT)),
+        "reconstructing": Reconstructing(surfaces, chosen(_SURFACES)),
+    }
 
 
 def tell(text: str) -> None:

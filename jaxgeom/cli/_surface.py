@@ -10,14 +10,18 @@ from ._report import Stages, mesh_facts, say, solver_facts, status_of, write_rep
 
 def settings(arguments) -> dict:
     """The keyword arguments of `reconstruct`."""
-    weight = arguments.point_weight
     return {
         "resolution": _resolution(arguments),
-        "method": Poisson() if weight == 0 else ScreenedPoisson(screening=weight),
+        "method": method_of(arguments.point_weight),
         "padding": arguments.scale - 1,
         "trim": arguments.trim,
         "min_component": arguments.min_component,
     }
+
+
+def method_of(weight: float | None):
+    """The solver with a screening weight: zero is plain Poisson."""
+    return Poisson() if weight == 0 else ScreenedPoisson(screening=weight)
 
 
 def finish(arguments, out, stages: Stages, inputs: dict, sound: bool = True) -> int:

@@ -93,7 +93,7 @@ class CellList(AbstractBackend):
         table = _table_size(points.shape[0])
         width = _fitting_width(width, high - low, table)
         counts = _cell_counts(high - low, width)
-        cell = _cell_id(_cell_of(points, low, width, counts).T, counts)
+        cell = cell_id(cell_of(points, low, width, counts).T, counts)
         cell = jnp.where(mask, cell, table)
         cell, order = jax.lax.sort(
             (cell, jnp.arange(points.shape[0], dtype=jnp.int32)), num_keys=1
@@ -136,12 +136,14 @@ def _cell_counts(extent, width):
     return (jnp.floor(extent / width) + 1).astype(jnp.int32)
 
 
-def _cell_of(points, low, width, counts):
+def cell_of(points, low, width, counts) -> Int[Array, "n 3"]:
+    """The cell of every point [n, 3]; outside of the grid the nearest one."""
     scaled = jnp.floor((points - low) / width)
     return jnp.clip(scaled, 0, (counts - 1).astype(points.dtype)).astype(jnp.int32)
 
 
-def _cell_id(cell, counts):
+def cell_id(cell, counts):
+    """The number of a cell, given by its three coordinates, first axis slowest."""
     return (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]
 
 
@@ -190,7 +192,7 @@ def _block(index, queries, span) -> _Block:
     x, y = jnp.divmod(jnp.arange(span**2, dtype=jnp.int32)[:, None], span)
     cell = first[:, 0] + x, first[:, 1] + y
     there = (cell[0] <= final[:, 0]) & (cell[1] <= final[:, 1])
-    row = jnp.where(there, _cell_id((*cell, 0), index.counts), 0)
+    row = jnp.where(there, cell_id((*cell, 0), index.counts), 0)
     begin = starts[row + first[:, 2]]
     length = jnp.where(there, starts[row + final[:, 2] + 1] - begin, 0)
     ends = jnp.cumsum(length, axis=0, dtype=jnp.int32)

@@ -44,7 +44,7 @@ class Reconstruction(eqx.Module):
       `density` (samples per unit of area) beside those of the cloud.
     - `field`: the `FieldSolution`; a field itself, negative inside.
     - `result`: the first status that is not success, of the solver or the extractor.
-    - `stats`: of the solver. `topology`: the check of the mesh (host form; else None).
+    - `stats`: of the solver. `topology`: the check of the mesh (host forms; else None).
     - `notes`: sentences on what was estimated, ignored or looks odd (host form).
     """
 

@@ -15,7 +15,7 @@ from .._core import (
     runtime_token,
 )
 from ..isosurface import Capacity, pad_outside
-from ..meshes import keep_faces, large_components
+from ..meshes import keep_faces, large_components, topology
 from ..normals import LocalPlanes
 from ..reconstruction import ScreenedPoisson
 from ..shapes import Grid, PointCloud, stack
@@ -65,8 +65,8 @@ def reconstruct_many(
     `too_few_points` (fewer than 4), `degenerate_input` (points that coincide, lie on a
     line, or without normals in a plane) and `zero_normals` (most are), each with an
     empty mesh and the text of the error among the `notes`. None is ever raised, and
-    the others are what they would be alone. `topology` is None: see
-    `meshes.topology`. Raises `GeometryError` for clouds that are no batch.
+    the others are what they would be alone. Raises `GeometryError` for clouds that are
+    no batch.
     """
     _check_batch(clouds)
     resolution = check_resolution(resolution)
@@ -139,7 +139,8 @@ def _solve(clouds, common, settings, mesh):
 
 @eqx.filter_jit
 def _extract(items, common, extractor, capacity, mesh):
-    """The mesh of every field, closed, without specks, with the density of samples."""
+    """The mesh of every field, closed, without specks, with the density of samples; its
+    status and its check."""
 
     def run(items, given):
         least, token = given
@@ -150,17 +151,18 @@ def _extract(items, common, extractor, capacity, mesh):
             found = extractor(values, grid, field.level, capacity=capacity, token=token)
             shown = with_attributes(found.mesh, field, cloud, token)
             large = large_components(shown, min_fraction=least)
-            return keep_faces(shown, large), found.result
+            mesh = keep_faces(shown, large)
+            return mesh, found.result, topology(mesh)
 
         return jax.lax.map(one, items)
 
     return on_each(run, mesh)(items, common)
 
 
-def _finished(field, mesh, status, item) -> Reconstruction:
+def _finished(field, mesh, status, check, item) -> Reconstruction:
     """One scan back in its unit and place, with its status."""
     result, notes = item.refusal, item.ready.notes
     if result is None:
         result, notes = first_failure(field.result, status), notes + notes_on(field)
     mesh, field = to_user(mesh.trim(), field, item.ready)
-    return Reconstruction(mesh, field, result, field.stats, None, notes)
+    return Reconstruction(mesh, field, result, field.stats, check, notes)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from jaxgeom import GeometryError, Rigid, register
+from jaxgeom import GeometryError, PointCloud, Rigid, register
 from jaxgeom.batch import (
     Registering,
     Shard,
@@ -23,7 +23,7 @@ from jaxgeom.batch import (
     warm_up,
 )
 from jaxgeom.cli import main
-from jaxgeom.io import load_mesh
+from jaxgeom.io import load_mesh, save_cloud
 from jaxgeom.pipelines import Pyramid, _register_many, choose_voxel_size
 
 _BAD = {
@@ -195,16 +195,21 @@ def _driver(manifest, out, *more, before=""):
     )
 
 
-@pytest.mark.slow
-def test_scans_without_a_target_are_reconstructed(tmp_path, capsys):
+@pytest.mark.parametrize(
+    "oriented", [True, pytest.param(False, marks=pytest.mark.slow)]
+)
+def test_scans_without_a_target_are_reconstructed(tmp_path, capsys, oriented):
     """Bad ones fail alone; meshes lie where the states say, and near the scans."""
     scans = {f"m{i}": _lumps(210 + 20 * i, i) for i in range(3)}
     scans["line"] = np.linspace(0, 1, 90)[:, None] * np.ones(3)
     scans["few"] = scans["m0"][:3]
     for name, points in scans.items():
-        np.save(tmp_path / f"{name}.npy", points)
+        # The lumps are seen whole from their center.
+        outward = points / np.linalg.norm(points + 1e-9, axis=1, keepdims=True)
+        cloud = PointCloud(points, outward if oriented else None)
+        save_cloud(tmp_path / f"{name}.ply", cloud)
     (tmp_path / "gone.ply").write_bytes(b"ply")
-    rows = [(name, tmp_path / f"{name}.npy", "") for name in scans]
+    rows = [(name, tmp_path / f"{name}.ply", "") for name in scans]
     rows += [("gone", tmp_path / "gone.ply", "")]
     manifest, out = _write(tmp_path, rows), tmp_path / "out"
     command = ["batch", manifest, "--out", str(out), "--chunk", "8"]
@@ -226,6 +231,11 @@ def test_scans_without_a_target_are_reconstructed(tmp_path, capsys):
     assert not list(out.rglob(".*"))
     assert main(command) == 6
     assert capsys.readouterr().out == "3 ok, 0 warning, 3 failed, 6 skipped\n"
+    if not oriented:
+        # A single scan is a program of its own.
+        (out / found["m1"]["mesh"]).unlink()
+        assert main(command) == 6
+        assert capsys.readouterr().out == "3 ok, 0 warning, 3 failed, 5 skipped\n"
     table = tmp_path / "table.csv"
     assert main(["batch-collect", str(out), "-o", str(table)]) == 0
     row = next(row for row in csv.DictReader(table.open()) if row["id"] == "m2")

@@ -2,6 +2,7 @@
 
 import os
 
+import jax
 import numpy as np
 import pytest
 import trimesh
@@ -61,6 +62,7 @@ def test_each_is_as_alone():
         alone = reconstruct(clean, resolution=RESOLUTION)
         assert found[i].result == alone.result
         np.testing.assert_array_equal(found[i].mesh.faces, alone.mesh.faces)
+        jax.tree.map(np.testing.assert_array_equal, found[i].topology, alone.topology)
         size = np.ptp(clean.points)
         vertices = found[i].mesh.vertices
         np.testing.assert_allclose(vertices, alone.mesh.vertices, atol=2e-4 * size)
