@@ -28,7 +28,7 @@ from jaxgeom import reconstruct
 from jaxgeom.batch import Reconstructing, run_batch
 from jaxgeom.io import load_mesh
 
-HEIGHT, LOOP, CHUNK = 0.9, 6, 8
+HEIGHT, LOOP, CHUNK = 0.9, 12, 8
 
 
 def make(folder, scans):
@@ -104,7 +104,9 @@ def main():
     ids = sorted(made)
     meshes = [load_mesh(args.folder / "out" / made[i]).vertices for i in ids]
     print(f"  {rate:.2f} scans a second; {told(meshes, numbers[ids])}", flush=True)
-    scans = [np.load(args.folder / f"{i}.npy") for i in range(LOOP)]
+    # As many small and large ones as the batch has.
+    some = range(0, len(numbers), max(1, len(numbers) // LOOP))
+    scans = [np.load(args.folder / f"{i}.npy") for i in some]
     loops = {"reconstruct": lambda p: reconstruct(p, resolution=args.resolution)}
     vertices = {"reconstruct": lambda out: np.asarray(out.mesh.vertices)}
     if speed.open3d is not None:
@@ -116,8 +118,8 @@ def main():
             [run(scan) for scan in scans]
         start = time.perf_counter()
         found = [run(scan) for scan in scans]
-        each = LOOP / (time.perf_counter() - start)
-        errors = told([vertices[name](x) for x in found], numbers[:LOOP])
+        each = len(scans) / (time.perf_counter() - start)
+        errors = told([vertices[name](x) for x in found], numbers[list(some)])
         print(f"loop over {name}: {each:.2f} scans a second, batch {rate / each:.2f}")
         print("  " + errors, flush=True)
 

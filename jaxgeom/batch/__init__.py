@@ -2,6 +2,8 @@
 
 from ._collect import collect as collect
 from ._collect import count as count
+from ._dask import client_at as client_at
+from ._dask import local_client as local_client
 from ._manifest import Scan as Scan
 from ._manifest import read_manifest as read_manifest
 from ._reconstructing import Reconstructing as Reconstructing

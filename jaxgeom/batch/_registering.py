@@ -52,6 +52,10 @@ class Registering(AbstractTask):
         self._target = held(lambda url: read_points(url, "target"))
         self._shared = held(self._share)
 
+    def __reduce__(self):
+        # A copy in another process prepares targets of its own.
+        return Registering, (self.settings, self.choices)
+
     def input_hash(self, scan):
         target = self._target(scan.target)
         given = _given_start(scan)

@@ -1,11 +1,14 @@
 """`jaxgeom batch MANIFEST --out DIR`."""
 
+import contextlib
 import os
 import sys
 
 from ..batch import (
     Reconstructing,
     Registering,
+    client_at,
+    local_client,
     run_batch,
     shard_of,
     shard_of_environment,
@@ -47,16 +50,25 @@ def run(arguments) -> int:
     """Register or reconstruct the scans of the shard that are not finished."""
     given = arguments.shard
     shard = shard_of(given) if given else shard_of_environment(os.environ)
-    tally = run_batch(
-        arguments.manifest,
-        arguments.out,
-        **tasks(arguments),
-        shard=shard,
-        retry_failed=arguments.retry_failed,
-        chunk=arguments.chunk,
-        tell=tell,
-    )
+    with _client(arguments.dask) as client:
+        tally = run_batch(
+            arguments.manifest,
+            arguments.out,
+            **tasks(arguments),
+            shard=shard,
+            retry_failed=arguments.retry_failed,
+            chunk=arguments.chunk,
+            client=client,
+            tell=tell,
+        )
     print(", ".join(f"{number} {name}" for name, number in tally.items()))
     if arguments.report:
         write_report(arguments.report, parameters=vars(arguments), result=tally)
     return SOME if tally["failed"] else OK
+
+
+def _client(asked: str | None):
+    """The workers that were asked for; None is this process."""
+    if asked is None:
+        return contextlib.nullcontext()
+    return local_client() if asked == "local" else client_at(asked)

@@ -139,6 +139,11 @@ def _add_batch(commands):
         "--shard", metavar="I/N", help="from 0/N (default: of the array job, or all)"
     )
     command.add_argument("--retry-failed", action="store_true")
+    command.add_argument(
+        "--dask",
+        metavar="local|ADDRESS",
+        help="workers of Dask: a process for each device here, or those of a scheduler",
+    )
     command = commands.add_parser(
         "warmup", help="compile what a batch will need into the cache"
     )

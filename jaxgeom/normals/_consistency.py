@@ -38,7 +38,7 @@ class AbstractOrientation(eqx.Module):
 class LocalPlanes(AbstractOrientation):
     """The normals of the planes through k neighbors, by `orient_consistently`.
 
-    Time grows with the square of `capacity`: 0.2, 0.7 and 3.3 s for 1024, 2048 and 4096
+    Time grows with the square of `capacity`: 0.1, 0.3 and 0.9 s for 1024, 2048 and 4096
     points on two cores. More of them matter on walls thinner than about a twentieth of
     the shape.
     """

@@ -22,13 +22,18 @@ _TILE = 128
 
 
 def consistent_dipoles(
-    points: Float[Array, "n 3"], real, *, widths: tuple[float, float], steps: int
+    points: Float[Array, "n 3"],
+    real,
+    start: Float[Array, "n 3"],
+    *,
+    widths: tuple[float, float],
+    steps: int,
 ) -> Float[Array, "n 3"]:
     """Dipoles [n, 3], outward, that make the winding number 1/2 on all points.
 
-    Steepest descent on |A mu - 1/2|^2, the direction of each dipole replaced after
-    each step by the regularised gradient; the width falls from the first to the last
-    of `widths`. The cost is steps n^2.
+    Steepest descent on |A mu - 1/2|^2 from `start`, the direction of each dipole
+    replaced after each step by the regularised gradient; the width falls from the first
+    to the last of `widths`. The cost is steps n^2.
     """
     real = real.astype(points.dtype)[:, None]
     ramp = jnp.linspace(0, 1, steps, dtype=points.dtype)
@@ -45,7 +50,7 @@ def consistent_dipoles(
         length = jnp.linalg.norm(dipoles, axis=-1, keepdims=True)
         return direction * length * real, None
 
-    return jax.lax.scan(step, jnp.zeros_like(points), schedule)[0]
+    return jax.lax.scan(step, start, schedule)[0]
 
 
 def potential(targets, points, dipoles, width) -> Float[Array, " m"]:
