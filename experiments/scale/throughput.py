@@ -31,6 +31,7 @@ import numpy as np
 from experiments.registration import speed
 from jaxgeom.batch import run_batch
 from jaxgeom.fields import Box, Cylinder, Torus
+from jaxgeom.transforms import rotation_exp
 
 NUMBERS, CANDIDATES, SMALLEST, LARGEST, TEMPLATE = 8, 12_000, 500, 5_000, 2_000
 NOISE, DEGREES, DISTANCE, GATE, THREADS = 0.002, 20.0, 0.1, 0.15, 2
@@ -44,7 +45,7 @@ def flask(u):
     body = Box(jnp.stack([0.2 * wide[0], 0.12 * wide[1], 0.28 * wide[2]])).rounded(0.05)
     neck = Cylinder(0.06 * wide[3], 0.15, (0.05, 0.0, 0.4))
     grip = Torus(0.13 * wide[4], 0.03 * wide[5])
-    grip = grip.rotate(jnp.array([jnp.pi / 2, 0.0, 0.0]))
+    grip = grip.rotate(rotation_exp(jnp.array([jnp.pi / 2, 0.0, 0.0])))
     grip = grip.translate(jnp.stack([0.26 * wide[0], 0.0, 0.1 * wide[6]]))
     return body.blend(neck, 0.06 + 0.02 * u[7]).blend(grip, 0.03)
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._core import GeometryError, message
 from ..transforms import Rigid, Similarity
 from ._claims import LOWER_BOUND, Bounds, Claims, Exactness
 from ._parameters import scalar, vector
@@ -140,8 +141,19 @@ class AbstractField(eqx.Module):
         return self.transformed(Rigid(eye, shift))
 
     def rotate(self, rotation: Float[Array, "3 3"]) -> "AbstractField":
-        """The body turned about the origin by a rotation matrix [3, 3]."""
+        """The body turned about the origin by a rotation matrix [3, 3].
+
+        Raises `GeometryError` for other shapes, such as a rotation vector [3].
+        """
         rotation = jnp.asarray(rotation)
+        if rotation.shape != (self.dimension, self.dimension):
+            raise GeometryError(
+                message(
+                    f"rotation must be a matrix {(self.dimension, self.dimension)}",
+                    f"shape {rotation.shape}",
+                    "transforms.rotation_exp makes one of a rotation vector.",
+                )
+            )
         still = jnp.zeros(rotation.shape[0], rotation.dtype)
         return self.transformed(Rigid(rotation, still))
 

@@ -76,13 +76,13 @@ def fit_field(
     """
     ready = unit_box(cloud)
     size = bucket(ready.cloud.points.shape[0])
-    bare = PointCloud(ready.cloud.points, ready.cloud.normals)
-    unit = jax.tree.map(lambda x: jnp.asarray(x[0]), stack([bare], capacity=size))
+    unit = jax.tree.map(
+        lambda x: jnp.asarray(x[0]), stack([bare(ready)], capacity=size)
+    )
     loss = SurfaceLoss() if loss is None else loss
     out = train(field, loss, unit, key=key, adam=adam, progress=progress)
-    error = _error(out.model, unit)
-    missed = failure_where(~(error <= rtol), RESULTS.not_converged)
-    result = first_failure(out.result, missed)
+    error = eqx.filter_jit(mean_miss)(out.model, unit)
+    result = first_failure(out.result, failure_to_reach(error, rtol))
     if throw and bool(result == RESULTS.diverged):
         raise GeometryError(
             message(
@@ -92,13 +92,28 @@ def fit_field(
                 "Lower Adam(rate=...), or pass throw=False to look at the field.",
             )
         )
-    placed = out.model.transformed(_user_from_unit(ready))
+    return in_place(out.model, error, out.losses, result, ready)
+
+
+def bare(ready) -> PointCloud:
+    """The cloud without attributes."""
+    return PointCloud(ready.cloud.points, ready.cloud.normals)
+
+
+def failure_to_reach(error, rtol) -> RESULTS:
+    """`not_converged` for an error above `rtol`, NaN included."""
+    return failure_where(~(error <= rtol), RESULTS.not_converged)
+
+
+def in_place(unit_field, error, losses, result, ready) -> FittedField:
+    """A field of the unit box where the user's points are."""
+    placed = unit_field.transformed(_user_from_unit(ready))
     width = np.asarray(error, float) * ready.scale
-    return FittedField(placed, out.model, width, out.losses, result, ready.notes)
+    return FittedField(placed, unit_field, width, losses, result, ready.notes)
 
 
-@eqx.filter_jit
-def _error(field, cloud):
+def mean_miss(field, cloud) -> Float[Array, ""]:
+    """The mean |f| over the points of a cloud."""
     washed = cloud.washed()
     values = jnp.abs(jax.vmap(field)(washed.points))
     return jnp.sum(jnp.where(washed.mask, values, 0)) / jnp.sum(washed.mask)

@@ -1,26 +1,19 @@
 """The meshes of a ragged batch of scans, in two compiled calls."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._core import (
-    RESULTS,
-    GeometryError,
-    first_failure,
-    message,
-    runtime_token,
-)
+from .._core import first_failure, runtime_token
 from ..isosurface import Capacity, pad_outside
 from ..meshes import keep_faces, large_components, topology
 from ..normals import LocalPlanes
 from ..reconstruction import ScreenedPoisson
-from ..shapes import Grid, PointCloud, stack
+from ..shapes import Grid, PointCloud
 from ._devices import gathered, on_each, placed
-from ._prepare import Prepared, Refused, notes_on_normals, unit_box
+from ._items import items_of, together
+from ._prepare import notes_on_normals
 from ._reconstruct import (
     EXTRACTOR,
     Reconstruction,
@@ -29,13 +22,6 @@ from ._reconstruct import (
     to_user,
     with_attributes,
 )
-
-
-class _Item(eqx.Module):
-    """A scan in its unit box; `refusal` is the status of one that has no surface."""
-
-    ready: Prepared
-    refusal: RESULTS | None
 
 
 def reconstruct_many(
@@ -68,13 +54,12 @@ def reconstruct_many(
     the others are what they would be alone. Raises `GeometryError` for clouds that are
     no batch.
     """
-    _check_batch(clouds)
     resolution = check_resolution(resolution)
     method = ScreenedPoisson() if method is None else method
     extractor = EXTRACTOR if extractor is None else extractor
     orientation = LocalPlanes() if orientation is None else orientation
-    scans = [_item(clouds, i) for i in range(clouds.points.shape[0])]
-    unit = stack([scan.ready.cloud for scan in scans], capacity=clouds.points.shape[1])
+    scans = items_of(clouds, "reconstruct", notes_on_normals)
+    unit = together(scans, clouds.points.shape[1])
     items, mesh = placed(unit)
     dtype = jax.dtypes.canonicalize_dtype(unit.points.dtype)
     token = runtime_token()
@@ -87,34 +72,6 @@ def reconstruct_many(
     found = gathered((fields, *found), len(scans))
     rows = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(len(scans)))
     return [_finished(*row, scan) for row, scan in zip(rows, scans, strict=True)]
-
-
-def _check_batch(clouds):
-    if clouds.points.ndim != 3:
-        raise GeometryError(
-            message(
-                "clouds must be a batch of points [b, n, 3]",
-                f"points of shape {tuple(clouds.points.shape)}",
-                "Make a batch with jaxgeom.stack, or call reconstruct.",
-            )
-        )
-
-
-def _item(clouds, i) -> _Item:
-    """Scan number `i`, as `prepare` takes it, but missing normals stay missing."""
-    cloud = jax.tree.map(lambda x: np.asarray(x[i]), clouds)
-    there = cloud.mask & np.isfinite(cloud.points).all(axis=1)
-    cloud = eqx.tree_at(lambda c: c.mask, cloud, there)
-    try:
-        ready = unit_box(cloud)
-        notes = (*ready.notes, *notes_on_normals(ready.cloud))
-        return _Item(dataclasses.replace(ready, notes=notes), None)
-    except Refused as refused:
-        # The program runs on an empty cloud, and no one looks at what comes out.
-        empty = jax.tree.map(np.zeros_like, cloud)
-        where = (np.zeros(3), 1.0, cloud.points.dtype)
-        ready = Prepared(empty, None, *where, (str(refused),))
-        return _Item(ready, refused.status)
 
 
 @eqx.filter_jit

@@ -111,7 +111,23 @@ def screened_poisson(
     return method(cloud, grid, weights=weights, token=token)
 
 
+class System(eqx.Module):
+    """What is solved: (L + W^T diag(pull) W) u = side; coefficients weigh L."""
+
+    seen: Measured
+    side: Float[Array, "x y z"]
+    pull: Float[Array, " n"]
+    coefficients: Float[Array, " 3"]
+    screening: Float[Array, ""]
+
+
 def _solve(cloud, grid, method, screening, weights, token) -> FieldSolution:
+    system = system_of(cloud, grid, method, screening, weights, token)
+    return system.seen.answer(solution_of(system, method, token), system.screening)
+
+
+def system_of(cloud, grid, method, screening, weights, token) -> System:
+    """The linear system of a cloud; `screening` None is chosen from its noise."""
     seen = Measured.of(cloud, grid, weights, method.levels, token)
     found, ratios = seen.geometry, seen.unit / grid.spacing
     if screening is None:
@@ -120,17 +136,18 @@ def _solve(cloud, grid, method, screening, weights, token) -> FieldSolution:
     side = divergence(seen.q, vectors, found.area, grid.shape, seen.levels, token=token)
     # A sample of many cells belongs to a coarser grid, whose 1 / h is weaker.
     pull = screening * seen.strength / jnp.sqrt(jnp.maximum(found.area, 1.0))
-    solution = _minimiser(side, seen.q, pull, ratios**2, method, token)
-    return seen.answer(solution, screening)
+    return System(seen, side, pull, ratios**2, screening)
 
 
-def _minimiser(side, q, pull, coefficients, method, token) -> LinearSolution:
-    fixed = method.boundary.fixed(side.shape)
+def solution_of(system: System, method, token) -> LinearSolution:
+    """The solution, with the sides of the method."""
+    fixed = method.boundary.fixed(system.side.shape)
     if fixed is None and isinstance(method, Poisson):
-        value = cosine_solve(side, coefficients)
+        value = cosine_solve(system.side, system.coefficients)
         return without_steps(value)
     settings = dict(rtol=method.rtol, max_steps=method.max_steps, token=token)
-    return minimise(side, q, pull, coefficients, fixed, **settings)
+    parts = (system.side, system.seen.q, system.pull, system.coefficients)
+    return minimise(*parts, fixed, **settings)
 
 
 def _screening_for(noise):

@@ -241,7 +241,7 @@ class Posterior(eqx.Module):
     def probability_inside(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The probability that the field is negative at points."""
         mean = interpolate(self.values, self.grid.index_of(points))
-        return _inside(mean, self.std(points))
+        return chance_inside(mean, self.std(points))
 
     def surface_density(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The density of the field at 0: how likely the surface passes there, per unit
@@ -251,7 +251,7 @@ class Posterior(eqx.Module):
         return safe_divide(norm.pdf(safe_divide(mean, std)), std)
 
 
-def _inside(mean, std):
+def chance_inside(mean, std):
     """The probability that a Gaussian number is negative; of a sure one, 0 or 1."""
     sure = std == 0
     unsure = norm.cdf(-mean / jnp.where(sure, 1, std))
@@ -262,48 +262,3 @@ def _root(variance):
     """The deviation; 0 with derivative 0 where rounding leaves no variance."""
     some = ~(variance <= 0)
     return jnp.where(some, jnp.sqrt(jnp.where(some, variance, 1)), 0)
-
-
-def probability_hit(
-    samples: Float[Array, "s x y z"], grid: Grid, points: Float[Array, "*r m 3"]
-) -> Float[Array, "*r"]:
-    """The share of sampled fields that are negative at any of some points [..., m, 3]:
-    a region, or the points along a ray. Joint, unlike the product over the points."""
-    flat = points.reshape(-1, 3)
-    found = lax.map(lambda v: interpolate(v, grid.index_of(flat)), samples)
-    hit = jnp.any(found.reshape(len(samples), *points.shape[:-1]) < 0, axis=-1)
-    return jnp.mean(hit, axis=0, dtype=samples.dtype)
-
-
-def view_score(
-    samples: Float[Array, "s x y z"],
-    grid: Grid,
-    origins: Float[Array, "r 3"],
-    directions: Float[Array, "r 3"],
-    *,
-    length: Float[Array, ""] | float,
-    num_steps: int = 64,
-) -> Float[Array, ""]:
-    """How much of what a camera sees is unknown: where to scan next, it is large.
-
-    With P(x) the probability inside at a point, from the mean and the deviation of the
-    samples at the nodes, the mean over the rays of
-
-        sum_j prod_{i < j} (1 - P_i)  (1/2 - |P_j - 1/2|) step,
-
-    a length: the path through unsure space before the ray has surely hit something.
-    Differentiable with respect to the rays, so to the pose of the camera.
-
-    **Arguments:** `origins`, `directions` (unit) of the rays, `length` that they are
-    followed, in `num_steps` steps. Outside of the grid nothing is seen.
-    """
-    inside = _inside(jnp.mean(samples, axis=0), jnp.std(samples, axis=0))
-    step = length / num_steps
-    t = (jnp.arange(num_steps) + 0.5) * step
-    points = origins[:, None] + t[:, None] * directions[:, None]
-    q = grid.index_of(points)
-    p = interpolate(inside, q.reshape(-1, 3)).reshape(points.shape[:2])
-    p = jnp.where(grid.holds(points), p, 0)
-    passed = jnp.cumprod(1 - p, axis=1)
-    before = jnp.concatenate([jnp.ones_like(p[:, :1]), passed[:, :-1]], axis=1)
-    return jnp.mean(jnp.sum(before * (0.5 - jnp.abs(p - 0.5)), axis=1)) * step

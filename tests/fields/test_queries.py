@@ -197,3 +197,9 @@ def test_pruned_samples_are_those_near_the_surface():
     assert int(short.required_bricks) > 40
     with pytest.raises(GeometryError, match="finite Lipschitz constant"):
         jf.sample_near_surface(lambda p: jnp.sum(p), grid, capacity=9)
+
+
+def test_a_rotation_vector_is_no_matrix():
+    for given in (np.array([1.5, 0.0, 0.0]), np.eye(2), np.eye(4)):
+        with pytest.raises(GeometryError, match="rotation_exp"):
+            jf.Sphere(1.0).rotate(given)

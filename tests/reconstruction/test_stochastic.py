@@ -9,14 +9,17 @@ import pytest
 
 from jaxgeom import RESULTS
 from jaxgeom._core import GeometryError
+from jaxgeom.fields import Camera
 from jaxgeom.meshes import icosphere, keep_faces
 from jaxgeom.reconstruction import (
     Matern,
     SquaredExponential,
     StochasticPoisson,
     face_probability,
+    next_view,
     probability_hit,
     stochastic_poisson,
+    tune,
     view_score,
 )
 from jaxgeom.shapes import Grid, PointCloud, TriangleMesh
@@ -315,3 +318,57 @@ def test_statuses_and_errors(x64):
     np.testing.assert_allclose(
         out.values, stochastic_poisson(rest, grid).values, atol=1e-3
     )
+
+
+@pytest.mark.slow
+def test_tuned_intervals_hold_what_they_say():
+    """A few wild normals widen a Gaussian; the last factor corrects it."""
+    rng = np.random.default_rng(2)
+    unit = rng.standard_normal((700, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    normals = unit + 0.05 * rng.standard_normal(unit.shape)
+    wild = rng.random(700) < 0.06
+    normals[wild] += rng.standard_normal((wild.sum(), 3))
+    some = lambda part: PointCloud(
+        *(jnp.asarray(x[part], jnp.float32) for x in (0.8 * unit, normals))
+    )
+    grid = Grid(jnp.full(3, -1.6), jnp.full(3, 0.2), (16, 16, 16))
+    cloud, held_out, others = some(slice(300)), some(slice(300, 400)), slice(400, 700)
+    found = jax.jit(lambda a, b: tune(a, grid, b, length=0.6, num_likely=80))(
+        cloud, held_out
+    )
+    assert found.result == RESULTS.successful
+    assert float(found.loss) < float(found.first_loss) - 0.1
+    assert 0.3 < float(found.widening) < 0.95
+    test = some(others)
+    mean, std = found.settings(cloud, grid).normals_at(test.points)
+    wide = jnp.sqrt(std**2 + found.settings.noise**2)[:, None]
+    covered = float(jnp.mean(jnp.abs(test.normals - mean) / wide < 1.6449))
+    assert 0.85 < covered < 0.95
+    before = float(
+        jnp.mean(jnp.abs(test.normals - mean) / wide * found.widening < 1.6449)
+    )
+    assert before > covered
+
+
+def test_the_next_view_looks_at_the_unknown_side():
+    """Half of a ball is known: a camera moves round to the other half."""
+    grid = Grid(jnp.full(3, -1.5), jnp.full(3, 0.25), (13, 13, 13))
+    nodes = grid.nodes()
+    ball = jnp.linalg.norm(nodes, axis=-1) - 0.8
+    unsure = jnp.maximum(nodes[..., 1], 0) * 0.6
+    draw = jnp.linspace(-1.2, 1.2, 8)[:, None, None, None]
+    samples = ball + unsure * draw
+    start = Camera(jnp.array([2.0, -1.5, 0.3]))
+    look = {"length": 4.0, "size": (6, 6)}
+    found = jax.jit(lambda c: next_view(samples, grid, c, **look))(start)
+    assert float(found.score) > 1.2 * float(found.first_score)
+    position = np.asarray(found.camera.position)
+    np.testing.assert_allclose(
+        np.linalg.norm(position), np.linalg.norm(start.position), rtol=1e-5
+    )
+    assert position[1] > 2.0
+    rays = found.camera.directions((6, 6)).reshape(-1, 3)
+    origins = jnp.broadcast_to(found.camera.position, rays.shape)
+    again = view_score(samples, grid, origins, rays, length=4.0, num_steps=48)
+    np.testing.assert_allclose(found.score, again, rtol=1e-5)
