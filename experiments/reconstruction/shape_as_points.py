@@ -29,7 +29,13 @@ sys.path.insert(0, os.path.dirname(__file__))
 import cases
 import methods
 
-SAMPLES, RESOLUTION, SIZE = 100_000, 128, (420, 340)
+SAMPLES, RESOLUTION = 100_000, 128
+SIZE = (420, 340)
+# Where the camera stands, and what is up.
+VIEWS = {
+    "gargoyle": ((0.9, -0.4, 2.0), (0.0, -1.0, 0.0)),
+    "nefertiti-noisy": ((0.8, 0.4, 1.8), (0.0, 1.0, 0.0)),
+}
 
 
 def samples(mesh, seed):
@@ -80,7 +86,8 @@ def main():
         )
         runs = {"screened": screened, "bare": bare, "as points": moved}
         found = [line(case, name, run) for name, run in runs.items()]
-        camera = Camera(np.array(methods.SIDES["gargoyle"]) * 1.9)
+        position, up = map(np.array, VIEWS[name])
+        camera = Camera(position, up=up)
         draw = lambda m, c=camera: render_mesh(m, c, size=SIZE)
         scan = render_cloud(case.cloud, camera, size=SIZE, radius=0.002)
         rows.append(side_by_side([scan, *map(draw, found)]))

@@ -50,7 +50,7 @@ class StochasticPoisson(eqx.Module):
     variance: Float[Array, ""] | float = 1 / 3
     noise: Float[Array, ""] | float = 0.1
     rtol: float = 1e-3
-    max_steps: int = 300
+    max_steps: int = eqx.field(static=True, default=300)
 
     def __call__(self, cloud, grid, *, weights=None) -> "Posterior":
         """The posterior given an oriented cloud; see `stochastic_poisson`."""
