@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .._core import RESULTS, first_failure
+from .._core import RESULTS, failure_where, first_failure
 from ..isosurface import Capacity, extract, marching_cubes
 from ..learning import Adam, train
 from ..linear import interpolate
@@ -39,7 +39,9 @@ class ShapeAsPoints(eqx.Module):
       of the scan.
     - `losses`: [steps] of every grid, in squared longest sides.
     - `result`: `diverged`, `not_converged` (a loss that did not fall on the first
-      grid), `no_surface`. `notes`: what was estimated or ignored.
+      grid), `no_surface`, `capacity_exceeded` (the surface has more area than four
+      sections of the grid, and the loss did not see all of it). `notes`: what was
+      estimated or ignored.
     """
 
     mesh: TriangleMesh
@@ -72,7 +74,7 @@ class _Distance(eqx.Module):
     def __call__(self, model, scan, key):
         index, points = scan
         values = model.field(self.grid, self.smoothing)
-        room = Capacity.for_surface(self.grid.shape)
+        room = _room(self.grid)
         mesh = marching_cubes(values, self.grid, capacity=room, normals=False).mesh
         key_surface, key_scan = jax.random.split(key)
         drawn = sample_surface(mesh, self.num_samples, key=key_surface)
@@ -80,6 +82,11 @@ class _Distance(eqx.Module):
         there = knn(index, drawn.points, 1, mask=drawn.mask)
         back = knn(build(drawn.points, drawn.mask), points[some], 1)
         return _mean_square(there) + _mean_square(back)
+
+
+def _room(grid) -> Capacity:
+    """Four times the largest section of the period; a sphere at the start has 0.8."""
+    return Capacity.for_surface(grid.shape)
 
 
 def _mean_square(near):
@@ -104,7 +111,8 @@ def shape_as_points(
     """The closed surface near a scan, found from a sphere by gradients (host form).
 
     No normals are needed, and none are used: that the surface is closed and near the
-    points decides the sides. Noise is averaged over cells and smoothing.
+    points decides the sides. Noise is averaged over cells and smoothing. Works in
+    single precision.
 
     **Arguments:**
 
@@ -138,7 +146,9 @@ def shape_as_points(
         found = train(model, loss, scan, key=key_train, adam=adam, progress=progress)
         model = found.model
         losses.append(found.losses)
-        results.append(found.result)
+        # On finer grids the loss begins where it was, and may end above it for noise.
+        lost = failure_where(found.num_skipped > 0, RESULTS.diverged)
+        results.append(lost if level else found.result)
         out = extract(model.field(grid, loss.smoothing), grid)
         large = large_components(out.mesh, min_fraction=min_component)
         mesh = keep_faces(out.mesh, large).trim()
@@ -147,7 +157,10 @@ def shape_as_points(
     placed = eqx.tree_at(lambda m: m.vertices, mesh, where(mesh.vertices))
     moved = PointCloud(where(model.points), model.vectors)
     error = jnp.sqrt(jnp.mean(last)) * ready.scale
-    result = first_failure(*results[:1], out.result)
+    short = failure_where(
+        len(out.mesh.vertices) > _room(grid).vertices, RESULTS.capacity_exceeded
+    )
+    result = first_failure(*results, short, out.result)
     return ShapeAsPoints(placed, moved, error, tuple(losses), result, ready.notes)
 
 
