@@ -78,6 +78,7 @@ def test_the_noise_has_the_covariance_of_the_system(x64):
     assert error.max() < 7 / np.sqrt(4000)
 
 
+@pytest.mark.slow
 def test_what_was_not_scanned_is_unsure():
     cloud, grid = _ball(800, half=True, dtype=np.float32), _grid(16, np.float32)
     found = jax.jit(lambda c: solver_posterior(c, grid, key=jax.random.key(1), num=24))(
