@@ -16,6 +16,7 @@ from .._core import GeometryError, message
 from ._chunks import Chunks
 from ._inputs import Refused
 from ._progress import Progress
+from ._states import STATES
 from ._tasks import Outcome
 from ._worker import Worker
 
@@ -62,8 +63,7 @@ class _Driver:
             if alone:
                 self._send(*self.suspects.pop())
             self._receive(alone)
-        nothing = Worker(*self.worker, print).tally
-        return {name: self.tally[name] for name in nothing}
+        return {name: self.tally[name] for name in (*STATES, "skipped")}
 
     def _send(self, call, scans, *more):
         arguments = (self.packed, scans, *more)
@@ -191,16 +191,15 @@ def _environments():
     shared = {"JAX_COMPILATION_CACHE_DIR": cache} if cache else {}
     # This process must not take the memory of a device that it does not use.
     ask = "import jax; print(jax.default_backend(), jax.local_device_count())"
-    told = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True)
-    platform, count = told.stdout.split()[-2:] if told.returncode == 0 else ("cpu", 1)
+    told = subprocess.check_output([sys.executable, "-c", ask], text=True)
+    platform, count = told.split()[-2:]
     if platform == "cpu":
         own = getattr(os, "sched_getaffinity", None)
         cores = len(own(0)) if own else os.cpu_count()
         # The processes are the division: each has one device and one core.
         return [{**shared, "PJRT_NPROC": "1", "JAX_NUM_CPU_DEVICES": "1"}] * cores
-    seen = os.environ.get("CUDA_VISIBLE_DEVICES") or ",".join(
-        map(str, range(int(count)))
-    )
+    every = ",".join(map(str, range(int(count))))
+    seen = os.environ.get("CUDA_VISIBLE_DEVICES") or every
     return [{**shared, "CUDA_VISIBLE_DEVICES": name} for name in seen.split(",")]
 
 

@@ -84,4 +84,5 @@ def _kept(scan, found, out) -> Outcome:
     told = dataclasses.replace(told, facts=facts)
     if told.status != "ok" or facts["watertight"]:
         return told
-    return dataclasses.replace(told, status="warning", code="not_watertight")
+    text = f"the mesh is not closed and manifold. {told.text}".strip()
+    return dataclasses.replace(told, status="warning", code="not_watertight", text=text)

@@ -69,18 +69,20 @@ def conjugate_gradients(
 
 
 class _State(eqx.Module):
-    """Where the iteration stands; `square` is |r|^2."""
+    """Where the iteration stands; `square` is |r|^2, `checked` what it was when the
+    residual was last recomputed."""
 
     x: Float[Array, "..."]
     r: Float[Array, "..."]
     p: Float[Array, "..."]
     rz: Float[Array, ""]
     square: Float[Array, ""]
+    checked: Float[Array, ""]
     steps: Int[Array, ""]
     phase: Int[Array, ""]
 
 
-# The first pass finds the residual of the start, the last one the true residual.
+# The first pass finds the residual of the start, a closing one the true residual.
 _OPENING, _ITERATING, _CLOSING, _DONE = range(4)
 
 
@@ -90,14 +92,16 @@ def iterate(
     """`conjugate_gradients` without derivative, for use inside other solvers.
 
     Every pass of the loop applies the operator once, to the iterate or to a direction,
-    so that a large operator is compiled once. `dot` is the inner product: that of grids
+    so that a large operator is compiled once. Where the recursive residual has arrived
+    and the true one has not, the iteration begins anew from there, unless the last time
+    that helped by less than a factor of two. `dot` is the inner product: that of grids
     in parts sums over the parts.
     """
     goal = jnp.asarray(rtol, b.dtype) ** 2 * dot(b, b)
     x = start(b)
     # Whatever p is, an infinite rz makes the first direction z itself.
     big, none = jnp.full((), jnp.inf, b.dtype), jnp.int32(0)
-    first = _State(x, b, x, big, big, none, jnp.int32(_OPENING))
+    first = _State(x, b, x, big, big, big, none, jnp.int32(_OPENING))
 
     def direction(state):
         z = preconditioner(state.r)
@@ -106,7 +110,7 @@ def iterate(
 
     def step(state):
         exact = state.phase != _ITERATING
-        at_iterate = lambda s: (s.x, s.rz)
+        at_iterate = lambda s: (s.x, big)
         p, rz = lax.cond(exact, at_iterate, direction, state)
         q = matvec(p)
         # A vanishing curvature means that the residual is rounding error already.
@@ -114,10 +118,11 @@ def iterate(
         r = jnp.where(exact, b, state.r) - jnp.where(exact, 1, length) * q
         square, steps = dot(r, r), state.steps + ~exact
         more = (square > goal) & (steps < max_steps)
-        ended = jnp.where(exact & (steps == 0), _DONE, _CLOSING)
-        phase = jnp.where(more, _ITERATING, ended)
-        phase = jnp.where(state.phase == _CLOSING, _DONE, phase).astype(jnp.int32)
-        return _State(state.x + length * p, r, p, rz, square, steps, phase)
+        more &= ~exact | (square < state.checked / 4)
+        phase = jnp.where(more, _ITERATING, jnp.where(exact, _DONE, _CLOSING))
+        checked = jnp.where(exact, square, state.checked)
+        x, phase = state.x + length * p, phase.astype(jnp.int32)
+        return _State(x, r, p, rz, square, checked, steps, phase)
 
     end = lax.while_loop(lambda s: s.phase != _DONE, step, first)
     residual = jnp.sqrt(safe_divide(end.square, dot(b, b)))

@@ -45,9 +45,9 @@ def orient_consistently(
     winding number 1/2 on the surface (see `_winding`): by `steps` iterations on a
     quarter of them, then a fifth as many, of cost capacity^2 each, on all. Every normal
     is turned along the gradient of their field, and then `votes` times to the side of
-    the majority of its k neighbors. Normals that the cloud
-    lacks are estimated from the k neighbors. Meant for closed surfaces and scans with
-    moderate holes. Signs are constants under differentiation.
+    the majority of its k neighbors. Normals that the cloud lacks are estimated from the
+    k neighbors. Meant for closed surfaces and scans with moderate holes. Signs are
+    constants under differentiation.
     """
     near = nearest_graph(cloud, k)
     normals = local_normals(cloud, near) if cloud.normals is None else cloud.normals

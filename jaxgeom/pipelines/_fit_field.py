@@ -81,7 +81,7 @@ def fit_field(
     )
     loss = SurfaceLoss() if loss is None else loss
     out = train(field, loss, unit, key=key, adam=adam, progress=progress)
-    error = eqx.filter_jit(mean_miss)(out.model, unit)
+    error = _error(out.model, unit)
     result = first_failure(out.result, failure_to_reach(error, rtol))
     if throw and bool(result == RESULTS.diverged):
         raise GeometryError(
@@ -117,6 +117,9 @@ def mean_miss(field, cloud) -> Float[Array, ""]:
     washed = cloud.washed()
     values = jnp.abs(jax.vmap(field)(washed.points))
     return jnp.sum(jnp.where(washed.mask, values, 0)) / jnp.sum(washed.mask)
+
+
+_error = eqx.filter_jit(mean_miss)
 
 
 def _user_from_unit(ready):

@@ -31,6 +31,12 @@ def items_of(
     what comes out. `notes` finds more of them, and may refuse. Raises `GeometryError`
     for what is no batch, and names the function for a scan `alone`.
     """
+    check_batch(clouds, alone)
+    return [_item(clouds, i, notes) for i in range(clouds.points.shape[0])]
+
+
+def check_batch(clouds: PointCloud, alone: str) -> None:
+    """Raise `GeometryError` for what is no batch [b, n, 3]."""
     if clouds.points.ndim != 3:
         raise GeometryError(
             message(
@@ -39,7 +45,6 @@ def items_of(
                 f"Make a batch with jaxgeom.stack, or call {alone}.",
             )
         )
-    return [_item(clouds, i, notes) for i in range(clouds.points.shape[0])]
 
 
 def together(items: list[Item], size: int) -> PointCloud:

@@ -4,10 +4,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from .._core import GeometryError, message
 from ..registration import Deformed, nonrigid
 from ..shapes import PointCloud, TriangleMesh
 from ._devices import gathered, on_each, placed
+from ._items import check_batch
 from ._register import masked
 
 
@@ -29,14 +29,7 @@ def nonrigid_many(template: TriangleMesh, targets: PointCloud, **settings) -> De
     those of `nonrigid`, one for each scan. Raises `GeometryError` for targets that are
     no batch.
     """
-    if targets.points.ndim != 3:
-        raise GeometryError(
-            message(
-                "targets must be a batch of points [b, n, 3]",
-                f"points of shape {tuple(targets.points.shape)}",
-                "Make a batch with jaxgeom.stack, or call registration.nonrigid.",
-            )
-        )
+    check_batch(targets, "registration.nonrigid")
     items, mesh = placed(masked(targets))
     template = jax.tree.map(jnp.asarray, template)
     found = _deform(items, (template, settings), mesh)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .._core import RESULTS, failure_where, first_failure
+from .._core import RESULTS, GeometryError, failure_where, first_failure, message
 from ..isosurface import Capacity, extract, marching_cubes
 from ..learning import Adam, train
 from ..linear import interpolate
@@ -129,8 +129,16 @@ def shape_as_points(
     - `progress`: called as progress(steps done on this grid, loss) every 100 steps.
 
     **Statuses:** see `ShapeAsPoints`. Raises `GeometryError` for the clouds that
-    `prepare` refuses.
+    `prepare` refuses, and unless every grid has its steps.
     """
+    if not 0 < len(resolutions) == len(steps):
+        raise GeometryError(
+            message(
+                "every grid must have its number of steps, and there must be one",
+                f"resolutions={resolutions}, steps={steps}",
+                "Pass two tuples of one length, such as (32, 64) and (300, 200).",
+            )
+        )
     ready = unit_box(cloud)
     points = jnp.asarray(ready.cloud.points, jnp.float32)
     scan = (build(points), points)

@@ -46,9 +46,7 @@ class Poisson(eqx.Module):
 
     def __call__(self, cloud, grid, *, weights=None, token=None) -> FieldSolution:
         """The field of `cloud` on `grid`; see `poisson`."""
-        return _solve(
-            cloud, grid, self, jnp.zeros((), cloud.points.dtype), weights, token
-        )
+        return _solve(cloud, grid, self, 0.0, weights, token)
 
 
 class ScreenedPoisson(eqx.Module):
@@ -66,10 +64,7 @@ class ScreenedPoisson(eqx.Module):
 
     def __call__(self, cloud, grid, *, weights=None, token=None) -> FieldSolution:
         """The field of `cloud` on `grid`; see `screened_poisson`."""
-        alpha = self.screening
-        if alpha is not None:
-            alpha = jnp.asarray(alpha, cloud.points.dtype)
-        return _solve(cloud, grid, self, alpha, weights, token)
+        return _solve(cloud, grid, self, self.screening, weights, token)
 
 
 def poisson(cloud: PointCloud, grid: Grid, *, weights=None, token=None, **settings):
@@ -132,6 +127,7 @@ def system_of(cloud, grid, method, screening, weights, token) -> System:
     found, ratios = seen.geometry, seen.unit / grid.spacing
     if screening is None:
         screening = _screening_for(found.noise)
+    screening = jnp.asarray(screening, cloud.points.dtype)
     vectors = seen.normals * ratios * seen.strength[:, None]
     side = divergence(seen.q, vectors, found.area, grid.shape, seen.levels, token=token)
     # A sample of many cells belongs to a coarser grid, whose 1 / h is weaker.

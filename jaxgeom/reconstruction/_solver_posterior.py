@@ -82,7 +82,8 @@ def solver_posterior(
     - `temperature`: tau; None: the mean of pull_p (u(x_p) - level)^2 over the samples,
       that of which their own residuals speak. The deviations grow with its root.
 
-    **Statuses:** as `screened_poisson`. Raises `GeometryError` for other sides.
+    **Statuses:** as `screened_poisson`. Raises `GeometryError` for other
+    sides, and for a screening that is not positive.
     """
     method = ScreenedPoisson(rtol=1e-3, max_steps=100) if method is None else method
     if not isinstance(method.boundary, Neumann):
@@ -93,10 +94,15 @@ def solver_posterior(
                 "Leave a wide margin around the cloud instead.",
             )
         )
-    alpha = method.screening
-    if alpha is not None:
-        alpha = jnp.asarray(alpha, cloud.points.dtype)
-    system = system_of(cloud, grid, method, alpha, weights, None)
+    if isinstance(method.screening, int | float) and not method.screening > 0:
+        raise GeometryError(
+            message(
+                "the screening of a solver posterior must be positive",
+                f"screening={method.screening}",
+                "Pass None, or from 0.1 (noisy) to 32 (clean and dense).",
+            )
+        )
+    system = system_of(cloud, grid, method, method.screening, weights, None)
     solution = solution_of(system, method, None)
     mean = system.seen.answer(solution, system.screening)
     if temperature is None:

@@ -6,20 +6,30 @@ minus the mean logarithm of the density of their normals n_i is, but for a const
     loss = mean_{i, d} ((n_id - m_id)^2 / (s_i^2 + t^2) + log(s_i^2 + t^2)) / 2.
 
 Normals beside edges lie far outside of a Gaussian, which widens it for all others: its
-central interval of 90 % then holds more. A last factor on all variances, which
-leaves the mean as it is, makes the interval hold what it says.
+central interval of 90 % then holds more, or, with few points, less. A last factor on
+all variances, which leaves the mean as it is, makes the interval hold what it says.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
-import optimistix as optx
 from jax.scipy.stats import norm
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from .._core import RESULTS, safe_divide
+from .._core import (
+    RESULTS,
+    GeometryError,
+    failure_where,
+    first_failure,
+    message,
+    safe_divide,
+)
 from ..shapes import Grid, PointCloud
+from ._descend import descend
 from ._kernels import Matern
 from ._stochastic import StochasticPoisson
+
+# Of the search, of the loss and of the logarithms.
+_RTOL = 1e-3
 
 
 class Tuned(eqx.Module):
@@ -36,7 +46,7 @@ class Tuned(eqx.Module):
     loss: Float[Array, ""]
     first_loss: Float[Array, ""]
     widening: Float[Array, ""]
-    steps: Array
+    steps: Int[Array, ""]
     result: RESULTS
 
 
@@ -69,7 +79,17 @@ def tune(
       linear system, the first `num_likely` are two in every step of the search.
     - `length`: of the kernel `Matern(length, smoothness)`, at the start; three spacings
       of the grid are usual.
+
+    Raises `GeometryError` for held-out points without normals.
     """
+    if held_out.normals is None:
+        raise GeometryError(
+            message(
+                "held-out points must have normals, which are what is predicted",
+                "normals=None",
+                "Set some points of the oriented cloud aside.",
+            )
+        )
 
     def settings_of(logarithms, factor=1.0):
         length, variance, noise = jnp.exp(logarithms)
@@ -87,28 +107,25 @@ def tune(
         wide = jnp.sqrt(std**2 + settings.noise**2)[:, None]
         return (normals[:num] - mean) / wide, wide
 
-    def loss(logarithms, _=None):
+    def loss(logarithms):
         error, wide = errors(settings_of(logarithms), num_likely)
         rows = jnp.where(there[:num_likely], error**2 / 2 + jnp.log(wide), 0)
         count = 3 * jnp.sum(there[:num_likely])
         return safe_divide(jnp.sum(rows), count.astype(rows.dtype))
 
-    start = jnp.log(
-        jnp.stack([jnp.asarray(x, float) for x in (length, variance, noise)])
+    given = [jnp.asarray(x, cloud.points.dtype) for x in (length, variance, noise)]
+    found = descend(
+        loss, jnp.log(jnp.stack(given)), rtol=_RTOL, max_steps=max_evaluations
     )
-    start = start.astype(cloud.points.dtype)
-    first = loss(start)
-    search = optx.BFGS(rtol=1e-3, atol=1e-3)
-    found = optx.minimise(loss, search, start, max_steps=max_evaluations, throw=False)
-    last = loss(found.value)
-    best = jnp.where(last < first, found.value, start)
-    apart = jnp.abs(errors(settings_of(best), len(points))[0])
+    apart = jnp.abs(errors(settings_of(found.value), len(points))[0])
     apart = jnp.where(there, apart, jnp.nan)
     widening = jnp.nanquantile(apart, coverage) / norm.ppf((1 + coverage) / 2)
-    done = found.result == optx.RESULTS.successful
-    result = RESULTS.where(done, RESULTS.successful, RESULTS.not_converged)
-    known = jnp.isfinite(first) & jnp.isfinite(widening)
-    result = RESULTS.where(known, result, RESULTS.nonfinite_input)
-    settings = settings_of(best, widening)
-    steps = found.stats["num_steps"]
-    return Tuned(settings, jnp.fmin(last, first), first, widening, steps, result)
+    blind = failure_where(~jnp.isfinite(widening), RESULTS.nonfinite_input)
+    return Tuned(
+        settings_of(found.value, widening),
+        found.loss,
+        found.first_loss,
+        widening,
+        found.steps,
+        first_failure(blind, found.result),
+    )

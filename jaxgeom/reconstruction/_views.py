@@ -2,15 +2,15 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .._core import RESULTS, safe_normalize
 from ..fields import Camera
 from ..linear import interpolate
 from ..shapes import Grid
 from ..transforms import rotation_exp
+from ._descend import descend
 from ._stochastic import chance_inside
 
 
@@ -18,11 +18,14 @@ def probability_hit(
     samples: Float[Array, "s x y z"], grid: Grid, points: Float[Array, "*r m 3"]
 ) -> Float[Array, "*r"]:
     """The share of sampled fields that are negative at any of some points [..., m, 3]:
-    a region, or the points along a ray. Joint, unlike the product over the points."""
+    a region, or the points along a ray. Joint, unlike the product over the points; NaN
+    where a sample is NaN."""
     flat = points.reshape(-1, 3)
     found = lax.map(lambda v: interpolate(v, grid.index_of(flat)), samples)
-    hit = jnp.any(found.reshape(len(samples), *points.shape[:-1]) < 0, axis=-1)
-    return jnp.mean(hit, axis=0, dtype=samples.dtype)
+    found = found.reshape(len(samples), *points.shape[:-1])
+    hit = jnp.any(found < 0, axis=-1).astype(samples.dtype)
+    known = jnp.all(jnp.isfinite(found), axis=-1)
+    return jnp.mean(jnp.where(known, hit, jnp.nan), axis=0)
 
 
 def view_score(
@@ -62,14 +65,15 @@ def view_score(
 class NextView(eqx.Module):
     """A camera about its target, moved to where it sees most of what is unknown.
 
-    `score` and `first_score` are the `view_score` there and at the start. `result` is
-    `not_converged` where the search was cut short; the camera is never a worse one.
+    `score` and `first_score` are the `view_score` there and at the start; the camera is
+    never a worse one. `result` is `not_converged` where the search was cut short,
+    `nonfinite_input` where a sample is NaN.
     """
 
     camera: Camera
     score: Float[Array, ""]
     first_score: Float[Array, ""]
-    steps: Array
+    steps: Int[Array, ""]
     result: RESULTS
 
 
@@ -109,19 +113,11 @@ def next_view(
         how = {"length": length, "num_steps": num_steps}
         return view_score(samples, grid, origins, rays, **how)
 
+    # In units of the score at the start, so that steps suit any length.
     still = jnp.zeros(3, camera.position.dtype)
     first = score(still)
     unit = jnp.where(first > 0, first, length)
-    found = optx.minimise(
-        lambda w, _: -score(w) / unit,
-        optx.BFGS(rtol=rtol, atol=rtol),
-        still,
-        max_steps=max_steps,
-        throw=False,
-    )
-    last = score(found.value)
-    best = jnp.where(last > first, found.value, still)
-    done = found.result == optx.RESULTS.successful
-    result = RESULTS.where(done, RESULTS.successful, RESULTS.not_converged)
-    steps = found.stats["num_steps"]
-    return NextView(turned(best), jnp.maximum(last, first), first, steps, result)
+    loss = lambda w: -score(w) / unit
+    found = descend(loss, still, rtol=rtol, max_steps=max_steps)
+    best = -unit * found.loss
+    return NextView(turned(found.value), best, first, found.steps, found.result)

@@ -162,6 +162,24 @@ def test_stopped_early_is_a_status_with_the_true_residual():
     np.testing.assert_allclose(out.residual, true, rtol=1e-4)
 
 
+def test_the_true_residual_arrives_and_not_only_the_recursive_one():
+    """In single precision the two drift apart, which must not look like a failure."""
+    rng = np.random.default_rng(0)
+    basis, _ = np.linalg.qr(rng.normal(size=(120, 120)))
+    a = jnp.asarray(basis * np.geomspace(1, 3e4, 120) @ basis.T, jnp.float32)
+    sides = jnp.asarray(rng.normal(size=(24, 120)), jnp.float32)
+    run = lambda b, rtol: conjugate_gradients(
+        lambda x: a @ x, b, rtol=rtol, max_steps=5000
+    )
+    found = jax.jit(jax.vmap(lambda b: run(b, 2e-3)))(sides)
+    assert np.all(found.residual <= 2e-3)
+    gap = np.linalg.norm(sides - found.value @ a, axis=1)
+    assert np.all(gap <= 2.2e-3 * np.linalg.norm(sides, axis=1))
+    # What rounding does not allow ends all the same, long before the last step.
+    never = jax.jit(lambda b: run(b, 1e-9))(sides[0])
+    assert never.result == RESULTS.not_converged and int(never.steps) < 4000
+
+
 def test_zero_right_side_gives_zero():
     shape, operator, _, _ = _screened(16, 3, 4.0, jnp.float32)
     out = conjugate_gradients(operator, jnp.zeros(shape), rtol=1e-5, max_steps=9)

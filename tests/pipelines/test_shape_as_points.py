@@ -42,6 +42,8 @@ def test_a_sphere_becomes_the_scan():
     cloud = (np.asarray(found.cloud.points) - CENTER) / AXES
     outward = np.sum(cloud * np.asarray(found.cloud.normals), axis=1)
     assert np.mean(outward > 0) > 0.97
+    with pytest.raises(GeometryError, match="number of steps"):
+        shape_as_points(_scan(9), key=key, steps=(5,))
     with pytest.raises(GeometryError, match="coincide"):
         shape_as_points(np.ones((9, 3)), key=key)
 

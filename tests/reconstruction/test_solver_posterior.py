@@ -93,6 +93,9 @@ def test_what_was_not_scanned_is_unsure():
         cloud, grid, key=jax.random.key(1), num=24, temperature=4 * found.temperature
     )
     np.testing.assert_allclose(hot.std(other), 2 * found.std(other), rtol=0.05)
+    with pytest.raises(GeometryError, match="positive"):
+        method = ScreenedPoisson(screening=0)
+        solver_posterior(cloud, grid, key=jax.random.key(1), method=method)
     with pytest.raises(GeometryError, match="Neumann"):
         method = ScreenedPoisson(boundary=Dirichlet())
         solver_posterior(cloud, grid, key=jax.random.key(1), method=method)

@@ -311,6 +311,15 @@ def test_statuses_and_errors(x64):
     empty = jnp.ones((4, *SHAPE))
     ray = (grid.origin[None] + 0.5, jnp.array([[1.0, 0.0, 0.0]]))
     assert view_score(empty, grid, *ray, length=2.0) == 0
+    torn = empty.at[2].set(jnp.nan)
+    assert np.isnan(probability_hit(torn, grid, cloud.points))
+    assert probability_hit(empty, grid, cloud.points) == 0
+    middle = grid.origin + grid.spacing * (np.array(SHAPE) - 1) / 2
+    camera = Camera(middle + np.array([4.0, 0.0, 0.0]), middle)
+    lost = next_view(torn, grid, camera, length=6.0)
+    assert lost.result == RESULTS.nonfinite_input
+    with pytest.raises(GeometryError, match="held-out"):
+        tune(cloud, grid, PointCloud(cloud.points), length=1.0)
     with pytest.raises(GeometryError, match="with normals"):
         StochasticPoisson()(PointCloud(cloud.points), grid)
     out = stochastic_poisson(cloud, grid, weights=jnp.arange(6) > 0.0)
