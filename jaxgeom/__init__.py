@@ -49,6 +49,7 @@ _NAMES = {
     "find_start": "pipelines",
     "fit_field": "pipelines",
     "fit_many": "pipelines",
+    "extract_many": "pipelines",
     "fuse": "pipelines",
     "nonrigid_many": "pipelines",
     "Reconstruction": "pipelines",

@@ -42,6 +42,20 @@ def tangents_to(n: Float[Array, " 3"]) -> Float[Array, "2 3"]:
     return jnp.stack([first, second])
 
 
+def eigen_two(
+    matrix: Float[Array, "2 2"],
+) -> tuple[Float[Array, " 2"], Float[Array, "2 2"]]:
+    """The eigenvalues of a symmetric matrix, largest first, and its unit eigenvectors
+    in the rows: with gradient zero, and those of the axes, where both values agree."""
+    mean = (matrix[0, 0] + matrix[1, 1]) / 2
+    half = jnp.stack([(matrix[0, 0] - matrix[1, 1]) / 2, matrix[0, 1]])
+    radius = safe_norm(half)
+    same = radius == 0
+    turn = jnp.arctan2(jnp.where(same, 0, half[1]), jnp.where(same, 1, half[0])) / 2
+    c, s = jnp.cos(turn), jnp.sin(turn)
+    return jnp.stack([mean + radius, mean - radius]), jnp.array([[c, s], [-s, c]])
+
+
 _BLOCK = 16
 _SMALL = 4096
 

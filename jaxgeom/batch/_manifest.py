@@ -14,6 +14,7 @@ from ..io import FileError
 
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
 _KEYS = {"id", "source", "target", "init", "parameters"}
+_ALIGNED, _RECONSTRUCTED = {"voxel_size"}, {"resolution", "trim"}
 
 
 class Scan(eqx.Module):
@@ -21,7 +22,8 @@ class Scan(eqx.Module):
     None.
 
     `init` is None, "mean", the place of a text file with a 4 x 4 matrix, or 4 rows of
-    4 numbers; `voxel_size` is None for that of the run.
+    4 numbers; `voxel_size` (with a target), `resolution` and `trim` (without) are None
+    for those of the run.
     """
 
     id: str = eqx.field(static=True)
@@ -29,6 +31,8 @@ class Scan(eqx.Module):
     target: str | None = eqx.field(static=True, default=None)
     init: str | tuple | None = eqx.field(static=True, default=None)
     voxel_size: float | None = eqx.field(static=True, default=None)
+    resolution: int | None = eqx.field(static=True, default=None)
+    trim: float | None = eqx.field(static=True, default=None)
 
 
 def read_manifest(path) -> Iterator[Scan]:
@@ -38,8 +42,9 @@ def read_manifest(path) -> Iterator[Scan]:
 
     - `path`: a `.jsonl` file of objects, or a CSV file with a header. Columns: `id`
       (letters, digits, dot, dash, underscore: it names the status file), `source`,
-      `target` (without one the scan is reconstructed), and if wanted, beside a target,
-      `init` and `parameters` (an object with `voxel_size`).
+      `target` (without one the scan is reconstructed), and if wanted `init` beside a
+      target, and `parameters`: an object with `voxel_size`, or without a target
+      `resolution` and `trim`.
 
     Raises `GeometryError` naming the line that is not as it must be, and `FileError`
     for a file that is not text.
@@ -89,34 +94,41 @@ def _scan(row, place) -> Scan:
             raise _bad(place, f"{key} {row.get(key)!r}")
     if not isinstance(row.get("target"), str | None):
         raise _bad(place, f"target {row['target']!r}")
-    if row.get("target") is None and {"init", "parameters"} & set(row):
-        raise _bad(place, "init or parameters without a target")
+    if row.get("target") is None and "init" in row:
+        raise _bad(place, "init without a target")
     if not _NAME.fullmatch(row["id"]):
         raise _bad(place, f"id {row['id']!r}")
-    size = _voxel_size(row.get("parameters") or {}, place)
+    own = _own(row, place)
     init = row.get("init")
     if isinstance(init, list):
         init = tuple(tuple(r) if isinstance(r, list) else r for r in init)
     elif init is not None and not isinstance(init, str):
         raise _bad(place, f"init {init!r}")
-    return Scan(row["id"], row["source"], row.get("target"), init, size)
+    return Scan(row["id"], row["source"], row.get("target"), init, **own)
 
 
-def _voxel_size(parameters, place):
-    if not isinstance(parameters, dict) or not set(parameters) <= {"voxel_size"}:
-        raise _bad(place, f"parameters {parameters!r}")
-    size = parameters.get("voxel_size")
-    if size is None:
-        return None
-    number = isinstance(size, int | float) and not isinstance(size, bool)
-    if not number or not 0 < size < math.inf:
-        raise _bad(place, f"voxel_size {size!r}")
-    return float(size)
+def _own(row, place) -> dict:
+    """The parameters of one line, checked."""
+    own = row.get("parameters") or {}
+    names = _RECONSTRUCTED if row.get("target") is None else _ALIGNED
+    if not isinstance(own, dict) or not set(own) <= names:
+        raise _bad(place, f"parameters {own!r}")
+    own = {name: value for name, value in own.items() if value is not None}
+    for name, value in own.items():
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not 0 < value < math.inf:
+            raise _bad(place, f"{name} {value!r}")
+        whole = int(value) == value and value >= 8
+        if name == "resolution" and not whole:
+            raise _bad(place, f"resolution {value!r}, which must be at least 8")
+    kind = lambda name: int if name == "resolution" else float
+    return {name: kind(name)(value) for name, value in own.items()}
 
 
 def _bad(place, given):
     must = (
         "a line must hold id (letters, digits, '.', '-', '_') and source, and may hold "
-        "target, and with it init and parameters {voxel_size}"
+        "target, with it init and parameters {voxel_size}, without it parameters "
+        "{resolution, trim}"
     )
     return GeometryError(message(f"{place}: {must}", given, "Correct the manifest."))

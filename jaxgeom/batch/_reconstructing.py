@@ -18,8 +18,10 @@ _MOST_BYTES = 2**30
 
 
 class _Key(eqx.Module):
-    """Scans of one call have the same attributes, and normals all or none."""
+    """Scans of one call have the same attributes, and normals all or none, and one
+    resolution and trim."""
 
+    own: tuple = eqx.field(static=True)
     kind: tuple = eqx.field(static=True)
     size: int = eqx.field(static=True)
 
@@ -39,17 +41,18 @@ class Reconstructing(AbstractTask):
 
     def input_hash(self, scan):
         digest = digest_of(scan.source, "source_unreadable")
-        return hash_of(digest, "", self.choices)
+        own = {name: x for name, x in _own(scan) if x is not None}
+        return hash_of(digest, "", {**self.choices, **own})
 
     def read(self, scan):
         with readable(scan.source, "source_unreadable") as path:
             cloud = load_cloud(path)
         named = sorted((k, np.shape(v)[1:]) for k, v in cloud.attributes.items())
         kind = (cloud.normals is not None, *named)
-        return _Key(kind, size_bucket(len(cloud.points))), cloud
+        return _Key(_own(scan), kind, size_bucket(len(cloud.points))), cloud
 
     def most(self, key, chunk):
-        field = _NODE_BYTES * self.settings["resolution"] ** 3
+        field = _NODE_BYTES * self._settings(key)["resolution"] ** 3
         return max(1, min(chunk, _MOST_BYTES // field))
 
     def program(self, key):
@@ -57,11 +60,23 @@ class Reconstructing(AbstractTask):
 
     def solve(self, key, scans, works, room, out):
         batch = padded_batch(works, room, key.size)
-        found = reconstruct_many(batch, **self.settings)[: len(works)]
-        return [_kept(*pair, out) for pair in zip(scans, found, strict=True)]
+        settings = self._settings(key)
+        found = reconstruct_many(batch, **settings)[: len(works)]
+        is_open = settings.get("trim") is not None
+        return [_kept(*pair, is_open, out) for pair in zip(scans, found, strict=True)]
+
+    def _settings(self, key):
+        """The settings of the run, but where the lines have their own."""
+        own = {name: x for name, x in key.own if x is not None}
+        return {**self.settings, **own}
 
 
-def _kept(scan, found, out) -> Outcome:
+def _own(scan):
+    """What a line says of its reconstruction, by name."""
+    return (("resolution", scan.resolution), ("trim", scan.trim))
+
+
+def _kept(scan, found, is_open, out) -> Outcome:
     """The outcome of a scan, once its mesh is written."""
     told = verdict(found.result)
     # Notes of a scan that was refused say why in its own numbers.
@@ -82,7 +97,8 @@ def _kept(scan, found, out) -> Outcome:
         "watertight": bool(check.is_closed & check.is_manifold),
     }
     told = dataclasses.replace(told, facts=facts)
-    if told.status != "ok" or facts["watertight"]:
+    # One that is trimmed is meant to be open.
+    if told.status != "ok" or facts["watertight"] or is_open:
         return told
     text = f"the mesh is not closed and manifold. {told.text}".strip()
     return dataclasses.replace(told, status="warning", code="not_watertight", text=text)

@@ -23,7 +23,7 @@ _ALIGNMENT = (
     *("objective", "kernel", "max_correspondence_distance", "voxel_size"),
     "with_scale",
 )
-_SURFACES = ("resolution", "point_weight", "orientation_points")
+_SURFACES = ("resolution", "point_weight", "orientation_points", "trim")
 
 
 def tasks(arguments) -> dict:
@@ -34,6 +34,7 @@ def tasks(arguments) -> dict:
         "resolution": arguments.resolution,
         "method": method_of(arguments.point_weight),
         "orientation": LocalPlanes(capacity=arguments.orientation_points),
+        "trim": arguments.trim,
     }
     return {
         "registering": Registering(aligned, chosen(_ALIGNMENT)),

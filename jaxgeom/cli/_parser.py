@@ -71,12 +71,7 @@ def _add_surface(command):
         default=1.1,
         help="side of the cube / longest side (1.1)",
     )
-    command.add_argument(
-        "--trim",
-        type=values.nonnegative,
-        metavar="T",
-        help="cut where samples are sparser than T x the median density",
-    )
+    _add_trim(command)
     command.add_argument(
         "--min-component",
         type=values.nonnegative,
@@ -85,6 +80,15 @@ def _add_surface(command):
         help="drop bodies below this share of the largest (0.01; 0 keeps all)",
     )
     command.add_argument("--report", metavar="JSON", help="parameters, sizes, statuses")
+
+
+def _add_trim(command):
+    command.add_argument(
+        "--trim",
+        type=values.nonnegative,
+        metavar="T",
+        help="cut where samples are sparser than T x the median density",
+    )
 
 
 def _add_point_weight(command):
@@ -160,7 +164,8 @@ def _add_manifest(command):
     command.add_argument(
         "manifest",
         metavar="MANIFEST",
-        help="CSV or JSONL: id, source, target, init; no target: reconstruct",
+        help="CSV or JSONL: id, source, target, init, parameters; no target: "
+        "reconstruct",
     )
     command.add_argument(
         "--chunk",
@@ -177,6 +182,7 @@ def _add_manifest(command):
         help="nodes of the grid of a scan without a target (64)",
     )
     _add_point_weight(command)
+    _add_trim(command)
     command.add_argument(
         "--orientation-points",
         type=values.chunk,

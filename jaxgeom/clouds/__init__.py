@@ -9,6 +9,7 @@ from ._boxes import crop as crop
 from ._boxes import oriented_box as oriented_box
 from ._farthest import farthest_points as farthest_points
 from ._frames import frames as frames
+from ._jets import principal_curvatures as principal_curvatures
 from ._merge import merge as merge
 from ._neighborhoods import PrincipalFrames as PrincipalFrames
 from ._neighborhoods import centered as centered

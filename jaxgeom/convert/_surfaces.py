@@ -1,10 +1,12 @@
 """From parametric surfaces to what is sampled from them."""
 
+from jaxtyping import Array, Float
+
 from ..fields import MeshDistance
-from ..parametric import AbstractSurface, tessellate
-from ..shapes import PointCloud, TriangleMesh
+from ..parametric import AbstractSurface, tessellate, tessellate_quads
+from ..shapes import Grid, PointCloud, PolygonMesh, TriangleMesh
 from ._clouds import vertices_to_cloud
-from ._fields import mesh_to_field
+from ._fields import mesh_to_field, mesh_to_grid
 
 
 def surface_to_mesh(
@@ -33,3 +35,20 @@ def surface_to_field(
     As near as the mesh is; `parametric.closest_point` knows the surface itself.
     """
     return mesh_to_field(tessellate(surface, resolution))
+
+
+def surface_to_polygons(
+    surface: AbstractSurface, resolution: tuple[int, int] = (32, 32)
+) -> PolygonMesh:
+    """The mesh of `surface_to_mesh` with its cells as quads, triangles at poles (host).
+
+    See `parametric.tessellate_quads`.
+    """
+    return tessellate_quads(surface, resolution)
+
+
+def surface_to_grid(
+    surface: AbstractSurface, grid: Grid, resolution: tuple[int, int] = (32, 32)
+) -> Float[Array, "x y z"]:
+    """The signed distance [x, y, z] of the mesh of a closed surface at the nodes."""
+    return mesh_to_grid(tessellate(surface, resolution), grid)

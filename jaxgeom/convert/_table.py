@@ -76,6 +76,61 @@ CONVERSIONS = (
     Conversion(
         "surface_to_field", "parametric", "field", False, "that mesh's signed distance"
     ),
+    Conversion(
+        "surface_to_polygons", "parametric", "polygons", False, "that mesh as quads"
+    ),
+    Conversion(
+        "surface_to_grid",
+        "parametric",
+        "grid values",
+        False,
+        "that mesh's distance at the nodes",
+    ),
+    Conversion(
+        "polygons_to_cloud", "polygons", "cloud", False, "points on the triangles"
+    ),
+    Conversion(
+        "polygons_to_field", "polygons", "field", False, "the triangles' distance"
+    ),
+    Conversion(
+        "polygons_to_grid", "polygons", "grid values", False, "that at the nodes"
+    ),
+    Conversion(
+        "grid_to_polygons",
+        "grid values",
+        "polygons",
+        False,
+        "the zero surface, as quads",
+    ),
+    Conversion(
+        "field_to_polygons", "field", "polygons", False, "the zero surface, as quads"
+    ),
+    Conversion(
+        "cloud_to_polygons", "cloud", "polygons", False, "the surface of its field"
+    ),
+    Conversion(
+        "mesh_to_surface", "mesh", "parametric", False, "a disc, smoothed to a NURBS"
+    ),
+    Conversion(
+        "polygons_to_surface", "polygons", "parametric", False, "the same of polygons"
+    ),
+    Conversion(
+        "grid_to_surface",
+        "grid values",
+        "parametric",
+        False,
+        "a sheet through the grid, smoothed",
+    ),
+    Conversion(
+        "field_to_surface", "field", "parametric", False, "a sheet, smoothed to a NURBS"
+    ),
+    Conversion(
+        "cloud_to_surface",
+        "cloud",
+        "parametric",
+        False,
+        "a sheet that is seen from one side",
+    ),
 )
 
 

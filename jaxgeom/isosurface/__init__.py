@@ -35,6 +35,7 @@ from ._marching_squares import marching_squares as marching_squares
 from ._placement import AbstractPlacement as AbstractPlacement
 from ._placement import Cubic as Cubic
 from ._placement import Linear as Linear
+from ._quads import quads as quads
 from ._refresh import Frozen as Frozen
 from ._refresh import follow as follow
 from ._refresh import freeze as freeze

@@ -1,13 +1,14 @@
 """Geometry, topology, curvature, repair and comparison of triangle meshes."""
 
+from ..shapes import PrincipalCurvatures as PrincipalCurvatures
 from ._barycentric import barycentric as barycentric
 from ._barycentric import interpolate_normals as interpolate_normals
-from ._curvature import PrincipalCurvatures as PrincipalCurvatures
 from ._curvature import angle_defects as angle_defects
 from ._curvature import gaussian_curvature as gaussian_curvature
 from ._curvature import mean_curvature as mean_curvature
 from ._curvature import mean_curvature_vectors as mean_curvature_vectors
 from ._curvature import principal_curvatures as principal_curvatures
+from ._disc import disc_parameters as disc_parameters
 from ._edge_list import Edges as Edges
 from ._edge_list import VertexNeighbors as VertexNeighbors
 from ._edge_list import boundary_vertices as boundary_vertices

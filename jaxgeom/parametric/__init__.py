@@ -70,5 +70,6 @@ from ._swept import frame as frame
 from ._tessellate import Layout as Layout
 from ._tessellate import layout as layout
 from ._tessellate import tessellate as tessellate
+from ._tessellate import tessellate_quads as tessellate_quads
 from ._trim import inside_loops as inside_loops
 from ._trim import tessellate_trimmed as tessellate_trimmed

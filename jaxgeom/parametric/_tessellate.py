@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._core import GeometryError, message
-from ..shapes import TriangleMesh
+from ..shapes import PolygonMesh, TriangleMesh
 from ._abstract import AbstractSurface
 from ._domain import Domain
 from ._queries import normal
@@ -48,23 +48,51 @@ def tessellate(
     return mesh_of(surface, plan.uv, plan.faces)
 
 
+def tessellate_quads(
+    surface: AbstractSurface, resolution: tuple[int, int] = (32, 32)
+) -> PolygonMesh:
+    """The cells of `tessellate` as quads, and as triangles at poles (host).
+
+    Vertices, attribute and errors are those of `tessellate`; a mesh of polygons has no
+    normals of its own.
+    """
+    uv, _, vertex, ids = _welded(surface.domain(), resolution)
+    cells = vertex[_cells(ids)]
+    # A pole is one corner: the one before it is left out.
+    again = cells == np.roll(cells, -1, axis=1)
+    corners = 4 - again.sum(axis=1)
+    groups = [
+        cells[corners == k][~again[corners == k]].reshape(-1, k).astype(np.int32)
+        for k in (3, 4)
+    ]
+    mesh = mesh_of(surface, uv, np.zeros((0, 3), np.int32))
+    return PolygonMesh(mesh.vertices, [g for g in groups if len(g)], mesh.attributes)
+
+
 def layout(domain: Domain, resolution: tuple[int, int]) -> Layout:
     """How `tessellate` glues the cells of a domain (host).
 
     Raises `GeometryError` for fewer than one cell, than three around a periodic
     parameter or than two between two poles.
     """
+    uv, nodes, vertex, ids = _welded(domain, resolution)
+    a, b, c, d = _cells(ids).T
+    corners = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    faces = vertex[corners]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return Layout(uv, faces[whole].astype(np.int32), nodes[corners[whole]])
+
+
+def _welded(domain, resolution):
+    """The parameters of the vertices and of all nodes, the vertex of each node, and the
+    numbers [u, v] of the nodes."""
     for name, along, cells in zip("uv", (domain.u, domain.v), resolution, strict=True):
         _check_cells(name, along, cells)
     u, v = domain.u.nodes(resolution[0]), domain.v.nodes(resolution[1])
     ids = np.arange(len(u) * len(v)).reshape(len(u), len(v))
-    labels = _glued(ids, domain)
-    kept, vertex = np.unique(labels, return_inverse=True)
-    uv = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
-    corners = _triangles(ids)
-    faces = vertex.reshape(-1)[corners]
-    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    return Layout(uv[kept], faces[whole].astype(np.int32), uv[corners[whole]])
+    kept, vertex = np.unique(_glued(ids, domain), return_inverse=True)
+    nodes = np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1).reshape(-1, 2)
+    return nodes[kept], nodes, vertex.reshape(-1), ids
 
 
 def mesh_of(surface: AbstractSurface, uv: np.ndarray, faces: np.ndarray):
@@ -78,10 +106,10 @@ def mesh_of(surface: AbstractSurface, uv: np.ndarray, faces: np.ndarray):
     return TriangleMesh(vertices, jnp.asarray(faces), normals, {"uv": uv})
 
 
-def _triangles(ids):
-    a, b = ids[:-1, :-1].ravel(), ids[1:, :-1].ravel()
-    c, d = ids[1:, 1:].ravel(), ids[:-1, 1:].ravel()
-    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+def _cells(ids):
+    """The corners of every cell [c, 4], counter-clockwise."""
+    corners = ids[:-1, :-1], ids[1:, :-1], ids[1:, 1:], ids[:-1, 1:]
+    return np.stack([x.ravel() for x in corners], axis=1)
 
 
 def _glued(ids, domain):

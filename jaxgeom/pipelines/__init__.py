@@ -1,5 +1,6 @@
 """The doors: whole pipelines, in a host form and a compiled form."""
 
+from ._extract_many import extract_many as extract_many
 from ._find_start import find_start as find_start
 from ._fit_field import FittedField as FittedField
 from ._fit_field import fit_field as fit_field

@@ -110,8 +110,9 @@ def reconstruct(
     mesh, status = _mesh(field, (values, grid), unit, extractor, capacity, token)
     check = _topology(mesh)
     if not closed or int(check.num_components) > 1:
-        cleaning = jnp.asarray([trim or 0.0, min_component], values.dtype)
-        mesh = _clean(mesh, field.stats.area, *cleaning)
+        share = None if closed else jnp.asarray(trim, values.dtype)
+        least = jnp.asarray(min_component, values.dtype)
+        mesh = _clean(mesh, field.stats.area, share, least)
         check = _topology(mesh)
     notes = ready.notes + notes_on(field)
     mesh, field = to_user(mesh.trim(), field, ready)
@@ -213,15 +214,16 @@ def _mesh(field, samples, cloud, extractor, capacity, token):
     return with_attributes(found.mesh, field, cloud, token), found.result
 
 
-@eqx.filter_jit
-def _clean(mesh, areas, trim, min_component):
-    """The mesh without what lies in gaps of the scan (0: keep all) and specks."""
-    areas = jnp.where(areas > 0, areas, jnp.nan)
-    sparsest = jnp.where(trim > 0, trim / jnp.nanmedian(areas), -jnp.inf)
-    mesh = trim_by_attribute(mesh, mesh.attributes["density"], sparsest)
+def cleaned(mesh, areas, trim, min_component):
+    """The mesh without what lies in gaps of the scan (None: keep it) and specks."""
+    if trim is not None:
+        areas = jnp.where(areas > 0, areas, jnp.nan)
+        sparsest = trim / jnp.nanmedian(areas)
+        mesh = trim_by_attribute(mesh, mesh.attributes["density"], sparsest)
     return keep_faces(mesh, large_components(mesh, min_fraction=min_component))
 
 
+_clean = eqx.filter_jit(cleaned)
 _topology = eqx.filter_jit(topology)
 
 

@@ -3,6 +3,7 @@
 from ._cloud import PointCloud as PointCloud
 from ._cloud import stack as stack
 from ._curvatures import Curvatures as Curvatures
+from ._curvatures import PrincipalCurvatures as PrincipalCurvatures
 from ._grid import Grid as Grid
 from ._mesh import TriangleMesh as TriangleMesh
 from ._polygons import PolygonMesh as PolygonMesh

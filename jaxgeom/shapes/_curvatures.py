@@ -1,10 +1,9 @@
-"""How a surface bends at a point."""
+"""How a surface bends."""
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._core import safe_norm
+from .._core import eigen_two
 
 
 class Curvatures(eqx.Module):
@@ -28,6 +27,21 @@ class Curvatures(eqx.Module):
         The derivative of equal eigenvalues is that of their mean.
         """
         (a, b), (_, c) = form
-        mean, spread = (a + c) / 2, safe_norm(jnp.stack([(a - c) / 2, b]))
-        principal = jnp.stack([mean + spread, mean - spread])
-        return Curvatures(mean, a * c - b * b, principal)
+        return Curvatures((a + c) / 2, a * c - b * b, eigen_two(form)[0])
+
+
+class PrincipalCurvatures(eqx.Module):
+    """The shape of a surface around every vertex of a mesh, or point of a cloud.
+
+    - `values` [n, 2]: the largest and the least normal curvature, in 1 / length,
+      positive where the surface bends away from its normal (a sphere from outside).
+    - `directions` [n, 2, 3]: the unit tangents they belong to. Arbitrary, and with
+      gradient zero, where both values are the same.
+    - `normals` [n, 3].
+
+    All zero where there is no surface, such as for padding.
+    """
+
+    values: Float[Array, "n 2"]
+    directions: Float[Array, "n 2 3"]
+    normals: Float[Array, "n 3"]

@@ -162,6 +162,10 @@ def test_manifests_of_both_forms_and_their_errors(tmp_path):
     assert (scan.id, scan.voxel_size, scan.init) == ("a", 2.0, None)
     path.write_text(json.dumps({"id": "b", "source": "x"}))
     assert next(read_manifest(path)).target is None
+    own = {"resolution": 32, "trim": 0.3}
+    path.write_text(json.dumps({"id": "b", "source": "x", "parameters": own}))
+    scan = next(read_manifest(path))
+    assert (scan.resolution, scan.trim, scan.voxel_size) == (32, 0.3, None)
     wrong = [
         {"id": "a", "source": "x", "init": "mean"},
         {**good, "target": 3},
@@ -170,6 +174,9 @@ def test_manifests_of_both_forms_and_their_errors(tmp_path):
         {**good, "colour": 1},
         {**good, "parameters": {"voxel_size": -1}},
         {**good, "parameters": {"speed": 1}},
+        {**good, "parameters": own},
+        {"id": "a", "source": "x", "parameters": {"resolution": 12.5}},
+        {"id": "a", "source": "x", "parameters": {"voxel_size": 1}},
     ]
     for row in wrong:
         path.write_text(json.dumps(row))
@@ -295,7 +302,8 @@ def test_a_killed_driver_goes_on_and_two_drivers_agree(work, tmp_path):
 
 
 @pytest.mark.slow
-def test_four_devices_equal_one(on_devices):
+@pytest.mark.parametrize("count", [4, 8])
+def test_many_devices_equal_one(on_devices, count):
     code = f"""
 import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})
 import jax, numpy as np
@@ -308,11 +316,11 @@ assert matrix.shape == (6, 4, 4)
 np.savez(sys.argv[1], n=jax.local_device_count(), matrix=matrix,
          fitness=found.fitness, steps=found.num_steps)
 """
-    one, four = (on_devices(code, count) for count in (1, 4))
-    assert one["n"] == 1 and four["n"] == 4
-    np.testing.assert_array_equal(one["steps"], four["steps"])
-    np.testing.assert_allclose(one["matrix"], four["matrix"], atol=1e-6)
-    np.testing.assert_allclose(one["fitness"], four["fitness"], atol=1e-6)
+    one, many = (on_devices(code, n) for n in (1, count))
+    assert one["n"] == 1 and many["n"] == count
+    np.testing.assert_array_equal(one["steps"], many["steps"])
+    np.testing.assert_allclose(one["matrix"], many["matrix"], atol=1e-6)
+    np.testing.assert_allclose(one["fitness"], many["fitness"], atol=1e-6)
 
 
 @pytest.mark.slow

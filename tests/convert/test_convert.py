@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxgeom import GeometryError, Grid, PointCloud, TriangleMesh, convert
+from jaxgeom import RESULTS, GeometryError, Grid, PointCloud, TriangleMesh, convert
 from jaxgeom.fields import Sphere, Torus
+from jaxgeom.isosurface import MarchingCubes
 from jaxgeom.meshes import box_mesh, icosphere, volume
 from jaxgeom.neighbors import closest_on_mesh
-from jaxgeom.parametric import Ellipsoid
+from jaxgeom.parametric import Ellipsoid, normal
 from jaxgeom.shapes import PolygonMesh
 
 CENTER, SIDES = np.asarray([3.0, -1.0, 2.0]), np.asarray([1.3, 0.7, 1.1])
@@ -44,7 +45,12 @@ def test_the_table_names_every_function_once():
     for c in convert.CONVERSIONS:
         assert callable(getattr(convert, c.function))
         assert f"| `{c.function}` | {c.source} | {c.target} |" in text
-        assert c.function.split("_to_")[1].split("_")[0] in c.target
+        short = {"parametric": "surface", "grid values": "grid"}
+        ends = [short.get(name, name) for name in (c.source, c.target)]
+        assert c.function == "_to_".join(ends) or c.function == "vertices_to_cloud"
+    kinds = {c.source for c in convert.CONVERSIONS}
+    pairs = {(c.source, c.target) for c in convert.CONVERSIONS}
+    assert pairs == {(a, b) for a in kinds for b in kinds if a != b}
 
 
 @pytest.mark.slow
@@ -156,3 +162,97 @@ def test_parametric_surfaces_become_meshes_clouds_and_fields():
     field = convert.surface_to_field(body, (48, 24))
     assert abs(float(field(jnp.float32([0, 0, 2.0]))) - 0.9) < 5e-3
     assert float(field(jnp.float32([0.1, 0.2, 0.1]))) < 0
+
+
+@pytest.mark.slow
+def test_parametric_surfaces_become_quads_and_samples():
+    """Quads are the cells of the triangles, with a cap of triangles at each pole."""
+    body = Ellipsoid(jnp.float32([1.3, 0.7, 1.1]))
+    quads, mesh = (
+        make(body, (12, 8))
+        for make in (convert.surface_to_polygons, convert.surface_to_mesh)
+    )
+    assert [f.shape for f in quads.faces] == [(24, 3), (72, 4)]
+    np.testing.assert_array_equal(quads.vertices, mesh.vertices)
+    again = convert.polygons_to_mesh(quads)
+    ordered = lambda faces: sorted(tuple(sorted(f)) for f in np.asarray(faces).tolist())
+    np.testing.assert_allclose(volume(again), volume(mesh), rtol=1e-5)
+    assert ordered(again.faces)[:24] == ordered(mesh.faces)[:24]
+    grid = Grid(jnp.full(3, -1.5), jnp.full(3, 1.0), (4, 4, 4))
+    values = convert.surface_to_grid(body, grid, (12, 8))
+    np.testing.assert_allclose(
+        values,
+        convert.polygons_to_grid(convert.mesh_to_polygons(mesh), grid),
+        atol=1e-5,
+    )
+    field = convert.polygons_to_field(convert.mesh_to_polygons(mesh))
+    np.testing.assert_allclose(values[1, 2, 1], field(grid.nodes()[1, 2, 1]), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_fields_samples_and_clouds_become_quads():
+    """Closed, one quad for each cut edge; vertices near the surface."""
+    grid = _grid(16)
+    from_field = convert.field_to_polygons(_body, grid)
+    values = convert.field_to_grid(_body, grid)
+    from_grid = convert.grid_to_polygons(values, grid)
+    (faces,) = from_field.faces
+    np.testing.assert_array_equal(faces, from_grid.faces[0])
+    assert faces.shape[1] == 4
+    signs = np.asarray(values) < 0
+    cut = sum(np.sum(np.diff(signs, axis=axis)) for axis in range(3))
+    assert len(faces) == cut
+    edges = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], -1).reshape(-1, 2))
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    assert float(jnp.abs(jax.vmap(_body)(from_field.vertices)).max()) < 0.1
+    cloud = convert.polygons_to_cloud(from_grid, 2000, key=jax.random.key(4))
+    assert float(jnp.abs(jax.vmap(_body)(cloud.points)).max()) < 0.1
+    found = convert.cloud_to_polygons(cloud, grid)
+    assert float(jnp.abs(jax.vmap(_body)(found.vertices)).max()) < 0.15
+    with pytest.raises(GeometryError, match="halves of a quad"):
+        convert.grid_to_polygons(values, grid, method=MarchingCubes())
+
+
+def _sheet(p):
+    """A field that is zero on a wavy sheet."""
+    return p[2] - 0.2 * jnp.sin(2 * p[0]) * jnp.cos(1.5 * p[1])
+
+
+def _off(surface):
+    """How far places of a surface are from the sheet, and the height of its normal."""
+    uv = jnp.stack(jnp.meshgrid(*[jnp.linspace(0.03, 0.97, 9)] * 2), -1).reshape(-1, 2)
+    normals = jax.vmap(lambda x: normal(surface, x))(uv)
+    return float(jnp.abs(jax.vmap(_sheet)(jax.vmap(surface)(uv))).max()), normals[:, 2]
+
+
+@pytest.mark.slow
+def test_sheets_become_nurbs():
+    """From a field, samples, a mesh, polygons and points; the side is kept."""
+    grid = Grid(jnp.float32([-1, -1.2, -1]), jnp.full(3, 2 / 23), (24, 28, 24))
+    mesh = convert.field_to_mesh(_sheet, grid).mesh
+    values = convert.field_to_grid(_sheet, grid)
+    points = np.random.default_rng(0).uniform(-1, 1, (3000, 2)).astype(np.float32)
+    heights = 0.2 * np.sin(2 * points[:, 0]) * np.cos(1.5 * points[:, 1])
+    up = np.broadcast_to(np.float32([0, 0, 1]), (3000, 3))
+    cloud = PointCloud(np.c_[points, heights], up)
+    found = {
+        "field": convert.field_to_surface(_sheet, grid),
+        "grid": convert.grid_to_surface(values, grid),
+        "mesh": convert.mesh_to_surface(mesh),
+        "polygons": convert.polygons_to_surface(convert.mesh_to_polygons(mesh)),
+        "cloud": convert.cloud_to_surface(cloud, (8, 8)),
+    }
+    for name, fit in found.items():
+        off, heights = _off(fit.shape)
+        assert fit.result == RESULTS.successful and float(fit.rmse) < 3e-3, name
+        assert off < 5e-3 and heights.min() > 0.5, name
+    below = convert.cloud_to_surface(PointCloud(cloud.points, -up), (8, 8))
+    assert _off(below.shape)[1].max() < -0.5
+    padded = jax.tree.map(lambda x: jnp.concatenate([x, x[:9] * 50]), cloud)
+    padded = PointCloud(padded.points, padded.normals, jnp.arange(3009) < 3000)
+    again = jax.jit(lambda c: convert.cloud_to_surface(c, (8, 8)))(padded)
+    np.testing.assert_allclose(
+        again.shape.control, found["cloud"].shape.control, atol=2e-3
+    )
+    with pytest.raises(GeometryError, match="must be a disc"):
+        convert.mesh_to_surface(icosphere(1))

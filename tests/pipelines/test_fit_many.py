@@ -72,7 +72,8 @@ def test_the_surfaces_go_through_the_scans():
 
 
 @pytest.mark.slow
-def test_four_devices_equal_one(on_devices):
+@pytest.mark.parametrize("count", [4, 8])
+def test_many_devices_equal_one(on_devices, count):
     code = f"""
 import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})
 import jax, numpy as np
@@ -81,7 +82,7 @@ found, _ = _many()
 np.savez(sys.argv[1], n=jax.local_device_count(), error=[x.error for x in found],
          losses=np.array([x.losses for x in found[::2]]))
 """
-    one, four = (on_devices(code, count) for count in (1, 4))
-    assert one["n"] == 1 and four["n"] == 4
-    np.testing.assert_allclose(one["losses"], four["losses"], rtol=1e-3, atol=1e-5)
-    np.testing.assert_allclose(one["error"][::2], four["error"][::2], rtol=1e-3)
+    one, many = (on_devices(code, n) for n in (1, count))
+    assert one["n"] == 1 and many["n"] == count
+    np.testing.assert_allclose(one["losses"], many["losses"], rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(one["error"][::2], many["error"][::2], rtol=1e-3)

@@ -58,7 +58,8 @@ def test_each_is_as_alone_and_lies_on_its_scan():
 
 
 @pytest.mark.slow
-def test_four_devices_equal_one(on_devices):
+@pytest.mark.parametrize("count", [4, 8])
+def test_many_devices_equal_one(on_devices, count):
     code = f"""
 import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})
 import jax, numpy as np
@@ -66,6 +67,6 @@ from test_nonrigid_many import _many
 found = _many()
 np.savez(sys.argv[1], n=jax.local_device_count(), v=found.mesh.vertices, r=found.rmse)
 """
-    one, four = (on_devices(code, count) for count in (1, 4))
-    assert one["n"] == 1 and four["n"] == 4
-    np.testing.assert_allclose(one["v"], four["v"], atol=2e-4)
+    one, many = (on_devices(code, n) for n in (1, count))
+    assert one["n"] == 1 and many["n"] == count
+    np.testing.assert_allclose(one["v"], many["v"], atol=2e-4)

@@ -136,6 +136,40 @@ def test_statuses_and_notes_of_scans_without_normals():
 
 
 @pytest.mark.slow
+def test_weights_and_trim_are_those_of_each_alone():
+    """Half of a scan is thinned, and cut off; ragged weights go with their points."""
+    rng = np.random.default_rng(0)
+    scans = []
+    for n, seed in ((900, 1), (700, 2)):
+        scan = _scan(n, seed)
+        keep = (scan.points[:, 0] < 0) | (rng.random(n) < 0.05)
+        scans.append(_float(PointCloud(scan.points[keep], scan.normals[keep])))
+    weights = [rng.uniform(0.2, 1.0, len(scan.points)) for scan in scans]
+    size = stack(scans).mask.shape[1]
+    padded = np.stack([np.pad(w, (0, size - len(w))) for w in weights])
+    choices = {"resolution": RESOLUTION, "extractor": MarchingCubes(), "trim": 0.3}
+    many = reconstruct_many(stack(scans), weights=padded, **choices)
+    for scan, weight, one in zip(scans, weights, many, strict=True):
+        alone = reconstruct(scan, weights=weight, **choices)
+        np.testing.assert_array_equal(one.mesh.faces, alone.mesh.faces)
+        np.testing.assert_allclose(one.mesh.vertices, alone.mesh.vertices, atol=1e-4)
+        assert not bool(one.topology.is_closed)
+        plain = reconstruct(scan, **choices)
+        assert len(plain.mesh.faces) != len(alone.mesh.faces) or not np.allclose(
+            plain.mesh.vertices, alone.mesh.vertices, atol=1e-4
+        )
+
+
+def test_fields_that_do_not_fit_together_are_refused():
+    scans = stack([_float(_scan(50, i)) for i in range(3)])
+    many = jax.tree.map(lambda x: np.repeat(x, 400, axis=0), scans)
+    with pytest.raises(GeometryError, match=r"(?s)memory.*fewer scans"):
+        reconstruct_many(many, resolution=512)
+    with pytest.raises(GeometryError, match="weights"):
+        reconstruct_many(scans, resolution=RESOLUTION, weights=np.ones((3, 49)))
+
+
+@pytest.mark.slow
 def test_attributes_arrive_at_the_vertices():
     scans = [
         PointCloud(s.points, s.normals, None, {"x": s.points[:, :1]})
@@ -152,7 +186,8 @@ def test_one_cloud_is_no_batch():
 
 
 @pytest.mark.slow
-def test_four_devices_equal_one(on_devices):
+@pytest.mark.parametrize("count", [4, 8])
+def test_many_devices_equal_one(on_devices, count):
     code = f"""
 import sys; sys.path.insert(0, {os.path.dirname(__file__)!r})
 import jax, numpy as np
@@ -163,8 +198,8 @@ np.savez(sys.argv[1], n=jax.local_device_count(),
          **{{f"v{{i}}": item.mesh.vertices for i, item in enumerate(found)}},
          **{{f"f{{i}}": item.mesh.faces for i, item in enumerate(found)}})
 """
-    one, four = (on_devices(code, count) for count in (1, 4))
-    assert one["n"] == 1 and four["n"] == 4
+    one, many = (on_devices(code, n) for n in (1, count))
+    assert one["n"] == 1 and many["n"] == count
     for i in range(5):
-        np.testing.assert_array_equal(one[f"f{i}"], four[f"f{i}"])
-        np.testing.assert_allclose(one[f"v{i}"], four[f"v{i}"], rtol=1e-5, atol=1e-5)
+        np.testing.assert_array_equal(one[f"f{i}"], many[f"f{i}"])
+        np.testing.assert_allclose(one[f"v{i}"], many[f"v{i}"], rtol=1e-5, atol=1e-5)
