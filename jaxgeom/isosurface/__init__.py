@@ -20,6 +20,8 @@ from ._extract import extract as extract
 from ._extract import pad_outside as pad_outside
 from ._extraction import Capacity as Capacity
 from ._extraction import Extraction as Extraction
+from ._flexi_solid import FlexiSolid as FlexiSolid
+from ._flexi_solid import flexicubes_solid as flexicubes_solid
 from ._flexicubes import AbstractQuadSplit as AbstractQuadSplit
 from ._flexicubes import Centers as Centers
 from ._flexicubes import Diagonals as Diagonals

@@ -233,7 +233,7 @@ def _place(values, level, dual: Dual, grid: Grid, weights: FlexiWeights):
     s0, s1 = (above.at[end].get(mode="clip") for end in ends)
     sound = jnp.isfinite(s0) & jnp.isfinite(s1)
     s0, s1 = jnp.where(sound, s0, 1.0), jnp.where(sound, s1, -1.0)
-    x0, x1 = (_moved_nodes(end, grid, weights.offsets) for end in ends)
+    x0, x1 = (moved_nodes(end, grid, weights.offsets) for end in ends)
     cell = _cell_index(patches.node, grid.shape)
     alpha = 1 + _REACH * jnp.tanh(weights.corners.reshape(-1))
     a0 = alpha[8 * cell + corner]
@@ -263,7 +263,8 @@ def _unevenness(reach, held):
     return jnp.sum(jnp.where(held, jnp.abs(reach - mean), 0.0), axis=0) / number
 
 
-def _moved_nodes(node, grid, offsets):
+def moved_nodes(node, grid, offsets):
+    """The places [..., 3] of nodes by their flat indices, with their offsets."""
     place = jnp.stack(coordinates(node, grid.shape), axis=-1)
     shift = jnp.tanh(offsets.reshape(-1, 3).at[node].get(mode="clip")) / 2
     return grid.origin + grid.spacing * (place + shift)
