@@ -1,4 +1,4 @@
-"""How fast all extractors are beside scikit-image and VTK's flying edges (CPU).
+"""How fast all extractors are beside scikit-image, VTK's flying edges and warp (CPU).
 
     python experiments/isosurface/extractors_speed.py --sizes 128 --repeats 5 --batch 16
 
@@ -55,7 +55,7 @@ def report(name, functions, repeats):
     """One line: times, and ratios to the peers."""
     taken = medians(functions, repeats)
     line = [f"{label} {ms:.1f}" for label, ms in taken.items()]
-    for peer in ("skimage", "vtk"):
+    for peer in ("skimage", "vtk", "warp"):
         if peer in taken:
             ratios = [f"{taken[own] / taken[peer]:.2f}" for own in METHODS]
             line.append(f"over {peer}: " + ", ".join(ratios))

@@ -77,7 +77,21 @@ def peers(values):
         out["vtk"] = _flying_edges(values)
     except ImportError:
         pass
+    try:
+        out["warp"] = _warp_cubes(values)
+    except ImportError:
+        pass
     return out
+
+
+def _warp_cubes(values):
+    """Marching cubes of warp on its CPU device."""
+    import warp as wp
+
+    wp.config.quiet = True
+    held = wp.array(np.ascontiguousarray(values, np.float32), device="cpu")
+    cubes = wp.geometry.IsoSurfaceMarchingCubes
+    return lambda: cubes.extract(held, 0.0)
 
 
 def _flying_edges(values):

@@ -30,6 +30,7 @@ from ._deformations import Tapered as Tapered
 from ._deformations import Twisted as Twisted
 from ._ellipsoids import Ellipse as Ellipse
 from ._ellipsoids import ExactEllipsoid as ExactEllipsoid
+from ._ellipsoids import Parabola as Parabola
 from ._field import AbstractField as AbstractField
 from ._field import Declared as Declared
 from ._field import bounding_box as bounding_box
@@ -80,6 +81,7 @@ from ._primitives import Plane as Plane
 from ._primitives import RoundedBox as RoundedBox
 from ._primitives import Sphere as Sphere
 from ._primitives import Torus as Torus
+from ._profiles import ChamferedRectangle as ChamferedRectangle
 from ._profiles import Cross as Cross
 from ._profiles import Gear as Gear
 from ._profiles import Parallelogram as Parallelogram
@@ -88,6 +90,7 @@ from ._profiles import Rectangle as Rectangle
 from ._profiles import RegularPolygon as RegularPolygon
 from ._profiles import Rhombus as Rhombus
 from ._profiles import RoundedRectangle as RoundedRectangle
+from ._profiles import Stairs as Stairs
 from ._profiles import Star as Star
 from ._profiles import Trapezoid as Trapezoid
 from ._profiles import Triangle as Triangle
@@ -132,6 +135,7 @@ from ._round_profiles import Horseshoe as Horseshoe
 from ._round_profiles import Moon as Moon
 from ._round_profiles import Pie as Pie
 from ._round_profiles import Ring as Ring
+from ._round_profiles import RoundedCross as RoundedCross
 from ._round_profiles import Tunnel as Tunnel
 from ._round_profiles import UnevenCapsule as UnevenCapsule
 from ._round_profiles import Vesica as Vesica

@@ -1,4 +1,4 @@
-"""The exact signed distance of ellipsoids and ellipses."""
+"""The exact signed distance of ellipsoids, ellipses and parabolas."""
 
 import equinox as eqx
 import jax
@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import safe_normalize
+from ._claims import Bounds, Claims
 from ._field import AbstractField
-from ._parameters import vector
+from ._parameters import scalar, vector
 from ._primitives import distance_about
 
 _NEWTON_STEPS = 12
@@ -49,6 +50,46 @@ class Ellipse(AbstractField):
 
     def claims(self):
         return distance_about(self.center, self.radii)
+
+
+class Parabola(AbstractField):
+    """The region y >= `coefficient` x^2 of the plane, coefficient > 0. Exact distance.
+
+    The closest point (s, k s^2) has s of the sign of x, and t = |s| is the positive
+    root of 2 k^2 t^3 + (1 - 2 k y) t = |x|, found by Newton's method from above, where
+    the cubic is convex.
+    """
+
+    coefficient: Float[Array, ""] = eqx.field(converter=scalar)
+
+    def evaluate(self, point):
+        s = jax.lax.stop_gradient(_foot_on_parabola(self.coefficient, *point))
+        foot = jnp.stack([s, self.coefficient * s**2])
+        # Outward, held at the same s as in `_distance`.
+        slope = 2 * jax.lax.stop_gradient(self.coefficient) * s
+        normal = safe_normalize(jnp.stack([slope, -jnp.ones_like(s)]))
+        return jnp.dot(normal, point - foot)
+
+    def claims(self):
+        low = jnp.array([-jnp.inf, 0.0], self.coefficient.dtype)
+        return Claims.distance(Bounds.of(low, jnp.full_like(low, jnp.inf)))
+
+
+def _foot_on_parabola(k, x, y):
+    """The abscissa of the closest point."""
+    far, linear = jnp.abs(x), 1 - 2 * k * y
+    above = jnp.cbrt(far / (2 * k**2)) + jnp.sqrt(jnp.maximum(-linear, 0) / 2) / k
+    start = jnp.where(
+        linear > 0, jnp.minimum(above, far / jnp.where(linear > 0, linear, 1)), above
+    )
+
+    def newton(_, t):
+        slope = 6 * k**2 * t**2 + linear
+        value = 2 * k**2 * t**3 + linear * t - far
+        return t - jnp.where(slope > 0, value / jnp.where(slope > 0, slope, 1), 0)
+
+    t = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, start)
+    return jnp.where(x < 0, -t, t)
 
 
 def _distance(y, radii):

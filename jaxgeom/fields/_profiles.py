@@ -51,6 +51,35 @@ class RoundedRectangle(AbstractField):
         return distance_about(self.center, self.half_extents)
 
 
+class ChamferedRectangle(AbstractOutlined):
+    """The rectangle of half extents [2] whose corners are cut off at 45 degrees, by
+    `chamfer` along both sides; less than both half extents. Exact distance."""
+
+    half_extents: Float[Array, " 2"] = eqx.field(converter=vector("half_extents", 2))
+    chamfer: Float[Array, ""] = eqx.field(converter=scalar)
+
+    def outline(self):
+        (w, h), c = self.half_extents, self.chamfer
+        right = [(w - c, -h), (w, c - h), (w, h - c), (w - c, h)]
+        return Outline.of([*right, *((-x, -y) for x, y in right)])
+
+
+class Stairs(AbstractOutlined):
+    """`count` steps (static) up to the right from the origin, each `step` [2] wide and
+    high, and what is below them. Exact distance."""
+
+    step: Float[Array, " 2"] = eqx.field(converter=vector("step", 2))
+    count: int = eqx.field(static=True)
+
+    def outline(self):
+        (w, h), n = self.step, self.count
+        zero = jnp.zeros_like(w)
+        corners = [(zero, zero), (n * w, zero)]
+        for i in range(n, 0, -1):
+            corners += [(i * w, i * h), ((i - 1) * w, i * h)]
+        return Outline.of(corners)
+
+
 class Polygon(AbstractOutlined):
     """The region inside a closed chain of vertices [n, 2] that does not cross itself.
 

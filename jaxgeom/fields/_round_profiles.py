@@ -168,6 +168,29 @@ class Egg(AbstractOutlined):
         return Outline.of(corners, [jnp.ones_like(b), side, cap, side])
 
 
+class RoundedCross(AbstractField):
+    """The star with four tips on the axes at `tips` [2], whose sides are arcs that touch
+    the x-axis; tips[1] is at most tips[0]. Exact distance.
+
+    In the first quadrant the arc has its center over the tip on the x-axis. At this
+    tip the region is a cusp, which an outline of arcs cannot tell apart.
+    """
+
+    tips: Float[Array, " 2"] = eqx.field(converter=vector("tips", 2))
+
+    def evaluate(self, point):
+        (x, y), p = self.tips, jnp.abs(point)
+        radius = (x**2 + y**2) / (2 * y)
+        on_arc = (p[0] < x) & (p[1] < y + p[0] * (radius - y) / x)
+        zero = jnp.zeros_like(x)
+        flank = radius - safe_norm(p - jnp.stack([x, radius]))
+        ends = jnp.stack([p - jnp.stack([x, zero]), p - jnp.stack([zero, y])])
+        return jnp.where(on_arc, flank, jnp.min(safe_norm(ends)))
+
+    def claims(self):
+        return distance_about(jnp.zeros_like(self.tips), self.tips)
+
+
 class Tunnel(AbstractOutlined):
     """A rectangle of half width `radius` from y = -depth to 0 under a half disk.
 

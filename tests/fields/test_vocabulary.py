@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from jaxgeom import fields as jf
 from jaxgeom.shapes import Grid, TriangleMesh
@@ -170,6 +170,8 @@ def test_outlines_agree_with_a_walk_along_them(x64):
         "star": jf.Star(0.7, 0.3),
         "cross": jf.Cross(0.6, 0.17),
         "gear": jf.Gear(0.5, 0.65, 9),
+        "chamfered_rectangle": jf.ChamferedRectangle((0.5, 0.3), 0.1),
+        "stairs": jf.Stairs((0.3, 0.2), 3),
     }
     points = POINTS[:, :2]
     values = jax.jit(lambda t, p: {k: jax.vmap(f)(p) for k, f in t.items()})(
@@ -184,6 +186,37 @@ def test_outlines_agree_with_a_walk_along_them(x64):
         np.testing.assert_array_equal(mine < 0, inside, err_msg=name)
         assert (gaps >= np.abs(mine) - 1e-9).all(), name
         assert (gaps - np.abs(mine)).max() < step, name
+
+
+def test_a_parabola_agrees_with_points_along_it(x64):
+    """Also on its axis, where two places are nearest, and far from its tip."""
+    points = np.concatenate([POINTS[:, :2], [[0, 1.0], [0, 0.1], [0, -2], [30, -5]]])
+    s = np.linspace(-3, 3, 600_001)
+    curve = np.stack([s, 1.3 * s**2], axis=1)
+    values = jax.jit(jax.vmap(jf.Parabola(1.3)))(jnp.asarray(points))
+    nearest = cKDTree(curve).query(points)[0]
+    sign = np.where(points[:, 1] > 1.3 * points[:, 0] ** 2, -1, 1)
+    np.testing.assert_allclose(values, sign * nearest, atol=1e-7)
+
+
+def test_a_rounded_cross_agrees_with_points_along_it(x64):
+    turn = np.linspace(0, 1, 4001)[:, None]
+    radius = (0.7**2 + 0.5**2) / (2 * 0.5)
+    angle = turn * np.arccos((radius - 0.5) / radius)
+    arc = np.concatenate(
+        [0.7 - radius * np.sin(angle), radius - radius * np.cos(angle)], 1
+    )
+    sides = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+    border = np.concatenate([arc * side for side in sides])
+    points = np.concatenate([POINTS[:, :2], [[0.7, -0.3], [0.9, 0.0], [0.0, 0.0]]])
+    values = jax.jit(jax.vmap(jf.RoundedCross((0.7, 0.5))))(jnp.asarray(points))
+    np.testing.assert_allclose(
+        np.abs(values), cKDTree(border).query(points)[0], atol=2e-4
+    )
+    p = np.abs(points)
+    inside = (p[:, 0] < 0.7) & (p[:, 1] < 0.5)
+    inside &= np.hypot(p[:, 0] - 0.7, p[:, 1] - radius) > radius
+    np.testing.assert_array_equal(values < 0, inside)
 
 
 def test_solids_agree_with_the_hull_of_their_corners(x64):
