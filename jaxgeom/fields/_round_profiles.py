@@ -169,7 +169,7 @@ class Egg(AbstractOutlined):
 
 
 class RoundedCross(AbstractField):
-    """The star with four tips on the axes at `tips` [2], whose sides are arcs that touch
+    """The star of four tips on the axes at `tips` [2], with arcs for sides that touch
     the x-axis; tips[1] is at most tips[0]. Exact distance.
 
     In the first quadrant the arc has its center over the tip on the x-axis. At this
