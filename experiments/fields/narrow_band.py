@@ -92,6 +92,7 @@ def of_libigl(name, n):
 def of_warp(name, n):
     """The mesh of warp, on the CPU."""
     import warp as wp
+    import warp.geometry
 
     center, steep, wave = wp.vec3(*_CENTER), wp.float32(_STEEP), 2 * math.pi / 0.25
 

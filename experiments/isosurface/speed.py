@@ -87,6 +87,7 @@ def peers(values):
 def _warp_cubes(values):
     """Marching cubes of warp on its CPU device."""
     import warp as wp
+    import warp.geometry
 
     wp.config.quiet = True
     held = wp.array(np.ascontiguousarray(values, np.float32), device="cpu")
