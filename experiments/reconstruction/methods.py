@@ -76,8 +76,9 @@ def line(case, name, method):
 def view(mesh, side):
     """The surface from one side."""
     unit = eqx.tree_at(lambda m: m.vertices, mesh, np.float32(mesh.vertices))
-    eye = 1.9 * np.asarray(side) / np.linalg.norm(side)
-    return render_mesh(unit, Camera(jnp.float32(eye), jnp.zeros(3)), size=(360, 360))
+    eye = 2.2 * np.asarray(side) / np.linalg.norm(side)
+    camera = Camera(jnp.float32(eye), up=jnp.array([0.0, 1.0, 0.0]))
+    return render_mesh(unit, camera, size=(360, 360))
 
 
 def main():

@@ -9,6 +9,8 @@ from ._fuse import Fusion as Fusion
 from ._fuse import fuse as fuse
 from ._iterated import IteratedPoisson as IteratedPoisson
 from ._memory import memory_needed as memory_needed
+from ._neural_posterior import NeuralPosterior as NeuralPosterior
+from ._neural_posterior import neural_posterior as neural_posterior
 from ._nonrigid_many import nonrigid_many as nonrigid_many
 from ._prepare import prepare as prepare
 from ._pyramid import Pyramid as Pyramid

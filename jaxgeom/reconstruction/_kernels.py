@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._core import GeometryError, message
 from ..shapes import Grid
 
 
@@ -16,6 +17,10 @@ class AbstractKernel(eqx.Module):
     @abstractmethod
     def spectrum(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
         """Its Fourier transform, up to a factor, at squared angular frequencies."""
+
+    @abstractmethod
+    def covariance(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
+        """k at squared distances, 1 at zero."""
 
 
 class SquaredExponential(AbstractKernel):
@@ -28,6 +33,9 @@ class SquaredExponential(AbstractKernel):
 
     def spectrum(self, square):
         return jnp.exp(-square * self.length**2 / 2)
+
+    def covariance(self, square):
+        return jnp.exp(-square / (2 * self.length**2))
 
 
 class Matern(AbstractKernel):
@@ -46,6 +54,23 @@ class Matern(AbstractKernel):
         nu = self.smoothness
         # Divided by the constant term, so that a long length does not underflow.
         return (1 + square * self.length**2 / (2 * nu)) ** -(nu + 1.5)
+
+    def covariance(self, square):
+        """In closed form for a smoothness of 1/2, 3/2 or 5/2, else `GeometryError`."""
+        if self.smoothness not in (0.5, 1.5, 2.5):
+            raise GeometryError(
+                message(
+                    "only a smoothness of 0.5, 1.5 or 2.5 has a covariance in closed "
+                    "form",
+                    f"{self.smoothness}",
+                    "Use one of these, or stochastic_poisson, which needs no form.",
+                )
+            )
+        some = square > 0
+        root = jnp.where(some, jnp.sqrt(jnp.where(some, square, 1)), 0)
+        r = (2 * self.smoothness) ** 0.5 * root / self.length
+        tail = {0.5: 1.0, 1.5: 1 + r, 2.5: 1 + r + r**2 / 3}[self.smoothness]
+        return tail * jnp.exp(-r)
 
 
 class Spectrum(eqx.Module):

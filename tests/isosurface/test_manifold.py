@@ -22,10 +22,12 @@ from jaxgeom.meshes import topology
 from jaxgeom.shapes import Grid
 
 # Each shape compiles its own programs: three of six are left to the slow run.
-_MORE = [(2, 5, 33), (270, 3, 4), (5, 6, 64)]
-SHAPES = [(9, 7, 11), (2, 2, 2), (4, 3, 300)] + [
-    pytest.param(shape, marks=pytest.mark.slow) for shape in _MORE
+_SLOW = [
+    pytest.param(shape, marks=pytest.mark.slow)
+    for shape in ((2, 5, 33), (270, 3, 4), (5, 6, 64))
 ]
+_QUICK = [(9, 7, 11), (2, 2, 2), (4, 3, 300)]
+SHAPES = [*_QUICK, *_SLOW]
 
 
 def noise(shape, seed=0):
@@ -125,7 +127,8 @@ def test_open_only_at_the_sides_of_the_grid(tools):
 
 
 @pytest.mark.parametrize(
-    "shape", [SHAPES[0], *(pytest.param(s, marks=pytest.mark.slow) for s in SHAPES[1:])]
+    "shape",
+    [_QUICK[0], *(pytest.param(s, marks=pytest.mark.slow) for s in _QUICK[1:]), *_SLOW],
 )
 def test_count_is_exact(tools, shape):
     values = jnp.asarray(noise(shape, 1))
