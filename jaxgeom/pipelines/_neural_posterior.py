@@ -29,7 +29,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jax.scipy.stats import norm
 from jaxtyping import Array, Bool, Float, Key
 
 from .._core import (
@@ -55,6 +54,7 @@ from ..learning import (
     train,
 )
 from ..reconstruction import AbstractKernel, Matern
+from ..reconstruction._stochastic import chance_inside, density_at_zero
 from ..shapes import PointCloud, stack
 from ._prepare import unit_box
 
@@ -147,15 +147,12 @@ class NeuralPosterior(AbstractField):
 
     def probability_inside(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The probability that the field is negative at points."""
-        std = self.std(points)
-        return norm.cdf(-safe_divide(jax.vmap(self)(points), std))
+        return chance_inside(jax.vmap(self)(points), self.std(points))
 
     def surface_density(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The density of the field at 0: how likely the surface passes there, per unit
         of the field."""
-        std = self.std(points)
-        mean = jax.vmap(self)(points)
-        return safe_divide(norm.pdf(safe_divide(mean, std)), std)
+        return density_at_zero(jax.vmap(self)(points), self.std(points))
 
     def _inside(self, point):
         return (point - self.middle) / self.size

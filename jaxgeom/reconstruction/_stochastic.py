@@ -246,9 +246,8 @@ class Posterior(eqx.Module):
     def surface_density(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The density of the field at 0: how likely the surface passes there, per unit
         of the field."""
-        std = self.std(points)
         mean = interpolate(self.values, self.grid.index_of(points))
-        return safe_divide(norm.pdf(safe_divide(mean, std)), std)
+        return density_at_zero(mean, self.std(points))
 
 
 def chance_inside(mean, std):
@@ -256,6 +255,11 @@ def chance_inside(mean, std):
     sure = std == 0
     unsure = norm.cdf(-mean / jnp.where(sure, 1, std))
     return jnp.where(sure, (mean < 0).astype(unsure.dtype), unsure)
+
+
+def density_at_zero(mean, std):
+    """The density of a Gaussian number at 0; 0 for a sure one."""
+    return safe_divide(norm.pdf(safe_divide(mean, std)), std)
 
 
 def _root(variance):

@@ -110,6 +110,7 @@ def test_gradients_are_central_differences(x64):
     np.testing.assert_allclose(slope, difference, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_padding_batches_and_places_without_a_surface():
     """Each of a ragged batch as alone; too few points and lost normals give zeros."""
     first, _ = _ellipsoid(_scattered(90, 1))

@@ -102,6 +102,7 @@ def test_sign_patterns_are_filled(x64, size, cases):
                 _check(jnp.asarray(values), grid, zero, Diagonals())
 
 
+@pytest.mark.slow
 def test_no_tetrahedron_of_a_ball_is_turned_over(x64):
     from_center = GRID.index_of(GRID.nodes()) - 4.03
     values = jnp.linalg.norm(from_center, axis=-1) - 2.7
@@ -136,6 +137,7 @@ def test_moved_vertices_and_their_derivatives(x64):
     np.testing.assert_allclose(sum(jax.tree.leaves(slope)), difference, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_no_surface_bad_values_and_bad_shapes(x64):
     grid = Grid(jnp.zeros(3), jnp.ones(3), (3, 3, 3))
     assert flexicubes_solid(jnp.ones((3, 3, 3)), grid).mesh.tetrahedra.shape == (0, 4)

@@ -137,6 +137,7 @@ def peer_distances(mesh, points):
     return np.linalg.norm(feet - pairs[1], axis=1).reshape(f, n).min(axis=0)
 
 
+@pytest.mark.slow
 def test_point_to_mesh_agrees_with_trimesh(x64):
     mesh = icosphere(1, radius=1.4)
     a, _ = two_clouds(60)

@@ -72,6 +72,7 @@ def test_the_vectors_are_those_of_dense_algebra(x64):
         np.testing.assert_allclose(found.covariance(rows, rows), known, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_draws_have_the_covariance_and_the_samples_are_the_anchor():
     cloud = _cap(60)
     found = _small(cloud)
@@ -96,6 +97,7 @@ def test_draws_have_the_covariance_and_the_samples_are_the_anchor():
     assert jax.tree.all(jax.tree.map(np.array_equal, found, again))
 
 
+@pytest.mark.slow
 def test_unit_place_and_padding():
     """A scan in another unit and place gives the same distribution there."""
     cloud = _cap(60)
