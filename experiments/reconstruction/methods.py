@@ -32,12 +32,12 @@ METHODS = {
     "ssd": SSD(),
     "screened": ScreenedPoisson(),
 }
-# Where the camera stands.
+# Where the camera stands, and whether y is up (1) or down there.
 SIDES = {
-    "anchor": (1, 0.6, 0.8),
-    "dc": (0.5, 0.3, 1),
-    "gargoyle": (0.5, 0.3, 1),
-    "nefertiti-7": (0.3, 0.1, 1),
+    "anchor": ((1, 0.6, 0.8), 1),
+    "dc": ((0.5, 0.3, 1), 1),
+    "gargoyle": ((0.5, 0.3, 1), -1),
+    "nefertiti-7": ((0.3, 0.1, 1), 1),
 }
 
 
@@ -73,11 +73,11 @@ def line(case, name, method):
     return out.mesh
 
 
-def view(mesh, side):
+def view(mesh, side, up=1):
     """The surface from one side."""
     unit = eqx.tree_at(lambda m: m.vertices, mesh, np.float32(mesh.vertices))
     eye = 2.2 * np.asarray(side) / np.linalg.norm(side)
-    camera = Camera(jnp.float32(eye), up=jnp.array([0.0, 1.0, 0.0]))
+    camera = Camera(jnp.float32(eye), up=jnp.array([0.0, float(up), 0.0]))
     return render_mesh(unit, camera, size=(360, 360))
 
 
@@ -97,7 +97,7 @@ def main():
             (case,) = cases.load(options.data, [name])
         meshes = [line(case, m, METHODS[m]) for m in options.methods]
         if options.picture:
-            rows.append(side_by_side([view(m, SIDES[name]) for m in meshes]))
+            rows.append(side_by_side([view(m, *SIDES[name]) for m in meshes]))
     if options.picture:
         save_png(options.picture, np.concatenate(rows, axis=0))
 

@@ -9,7 +9,7 @@ from jaxgeom import RESULTS, GeometryError
 from jaxgeom.meshes import topology
 from jaxgeom.pipelines import shape_as_points
 from jaxgeom.reconstruction import spectral_poisson
-from jaxgeom.shapes import Grid
+from jaxgeom.shapes import Grid, PointCloud
 
 AXES, CENTER = np.array([10.0, 7.0, 8.0]), np.array([100.0, -30.0, 4.0])
 SMALL = {"num_points": 500, "num_samples": 500}
@@ -90,3 +90,17 @@ def test_the_spectral_field_of_a_sphere_and_its_derivatives(x64):
         moved = lambda s, k=k, a=along, x=x: scalar(*at[:k], x + s * a, *at[k + 1 :])
         expected = (moved(h) - moved(-h)) / (2 * h)
         np.testing.assert_allclose(np.sum(slopes[k] * along), expected, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_masked_points_are_points_removed():
+    scan = np.float32(_scan(300))
+    run = lambda cloud: shape_as_points(
+        cloud, key=jax.random.key(3), resolutions=(16,), steps=(6,), **SMALL
+    )
+    grown = np.concatenate([scan, np.full((20, 3), 1e4, np.float32)])
+    masked = run(PointCloud(grown, None, np.arange(320) < 300))
+    plain = run(scan)
+    np.testing.assert_array_equal(masked.mesh.faces, plain.mesh.faces)
+    np.testing.assert_allclose(masked.mesh.vertices, plain.mesh.vertices, atol=1e-4)
+    np.testing.assert_allclose(masked.losses[0], plain.losses[0], rtol=1e-5)
