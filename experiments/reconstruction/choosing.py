@@ -25,7 +25,7 @@ import jaxgeom as jg
 from jaxgeom import learning
 from jaxgeom.io import load_mesh
 from jaxgeom.isosurface import extract
-from jaxgeom.meshes import keep_faces
+from jaxgeom.meshes import keep_faces, large_components
 from jaxgeom.normals import WindingConsistency
 from jaxgeom.reconstruction import (
     SSD,
@@ -95,12 +95,17 @@ def stochastic(cloud):
     some = PointCloud(cloud.points[chosen], cloud.normals[chosen])
     grid = Grid.around(some, resolution=64, padding=1.0)
     found = jax.jit(stochastic_poisson)(some, grid)
-    return extract(found.values, grid, closed=True).mesh
+    return _cleaned(extract(found.values, grid, closed=True).mesh)
 
 
 def _meshed(field, cloud, n):
     grid = Grid.around(cloud, resolution=n, padding=0.1)
-    return extract(field, grid, closed=True).mesh
+    return _cleaned(extract(field, grid, closed=True).mesh)
+
+
+def _cleaned(mesh):
+    """Without specks, as `reconstruct` cleans."""
+    return keep_faces(mesh, large_components(mesh, min_fraction=0.01)).trim()
 
 
 METHODS = {
