@@ -116,6 +116,7 @@ def test_outliers_are_those_of_scipy():
         radius_inliers(cloud, SIZE, least=0)
 
 
+@pytest.mark.slow
 def test_frames_and_density_are_those_of_numpy():
     cloud, n = _cloud(), 300
     points = np.asarray(cloud.points, float)[:n]

@@ -31,7 +31,9 @@ def _scattered(n, seed=0):
     return x / np.linalg.norm(x, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("degree, k", [(3, 24), (4, 32)])
+@pytest.mark.parametrize(
+    "degree, k", [(3, 24), pytest.param(4, 32, marks=pytest.mark.slow)]
+)
 def test_the_worst_point_of_an_ellipsoid_converges_at_the_order(x64, degree, k):
     """Vertices with five neighbors among them, at which means over faces do not."""
     worst = []
@@ -89,6 +91,7 @@ def test_a_quadric_is_exact_and_follows_motion_unit_and_side(x64):
     np.testing.assert_allclose(inside.values, -found.values[::-1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_are_central_differences(x64):
     cloud, _ = _ellipsoid(_scattered(60))
     rng = np.random.default_rng(3)

@@ -148,6 +148,7 @@ def test_polygons_and_triangles():
     assert box.faces.shape == (12, 3)
 
 
+@pytest.mark.slow
 def test_parametric_surfaces_become_meshes_clouds_and_fields():
     """The mesh is closed and inside, nearer by 4 with cells half as wide."""
     body = Ellipsoid(jnp.float32([1.3, 0.7, 1.1]))

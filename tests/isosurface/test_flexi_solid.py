@@ -79,7 +79,10 @@ def _check(values, grid, weights, split):
     return solid, surface
 
 
-@pytest.mark.parametrize("seed, split", [(0, Diagonals()), (1, Centers())])
+@pytest.mark.parametrize(
+    "seed, split",
+    [(0, Diagonals()), pytest.param(1, Centers(), marks=pytest.mark.slow)],
+)
 def test_white_noise_of_any_weights_is_filled(x64, seed, split):
     _check(_noise(seed), GRID, _weights(seed), split)
 

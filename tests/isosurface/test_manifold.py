@@ -47,7 +47,10 @@ def test_closed_after_padding(tools, shape, field):
         tools.assert_closed(out.mesh)
 
 
-@pytest.mark.parametrize("decider", [AsymptoticDecider(), TrilinearDecider()])
+@pytest.mark.parametrize(
+    "decider",
+    [pytest.param(AsymptoticDecider(), marks=pytest.mark.slow), TrilinearDecider()],
+)
 def test_closed_with_deciders_and_cubic_placement(tools, decider):
     method = MarchingCubes(placement=Cubic(), ambiguity=decider)
     for field, seed in itertools.product((noise, ties), range(6)):

@@ -159,7 +159,10 @@ def test_dtype_follows_the_values(x64, tools, dtype):
     assert mesh.faces.dtype == np.int32
 
 
-@pytest.mark.parametrize("short", ["vertices", "faces", "cells"])
+@pytest.mark.parametrize(
+    "short",
+    [pytest.param("vertices", marks=pytest.mark.slow), "faces", "cells"],
+)
 def test_overflow_is_told_and_leaves_a_valid_prefix(tools, short):
     values, grid = noise(10), tools.grid_of(SHAPE)
     full = extract(values, grid)

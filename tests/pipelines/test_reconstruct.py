@@ -35,7 +35,7 @@ def _closed(out):
     "scale, shift",
     [
         pytest.param(1.0, 0.0, marks=pytest.mark.slow),
-        (1e-6, 0.0),
+        pytest.param(1e-6, 0.0, marks=pytest.mark.slow),
         pytest.param(1e6, 3.0, marks=pytest.mark.slow),
         (2.0, 4e6),
     ],
