@@ -125,7 +125,6 @@ METHODS = {
 ONLY = {
     "trimmed": {"open", "partial"},
     "winding": {"unoriented"},
-    "as points": {"unoriented", "noisy"},
 }
 
 

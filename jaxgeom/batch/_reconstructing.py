@@ -41,8 +41,7 @@ class Reconstructing(AbstractTask):
 
     def input_hash(self, scan):
         digest = digest_of(scan.source, "source_unreadable")
-        own = {name: x for name, x in _own(scan) if x is not None}
-        return hash_of(digest, "", {**self.choices, **own})
+        return hash_of(digest, "", {**self.choices, **dict(_own(scan))})
 
     def read(self, scan):
         with readable(scan.source, "source_unreadable") as path:
@@ -67,13 +66,13 @@ class Reconstructing(AbstractTask):
 
     def _settings(self, key):
         """The settings of the run, but where the lines have their own."""
-        own = {name: x for name, x in key.own if x is not None}
-        return {**self.settings, **own}
+        return {**self.settings, **dict(key.own)}
 
 
 def _own(scan):
-    """What a line says of its reconstruction, by name."""
-    return (("resolution", scan.resolution), ("trim", scan.trim))
+    """What a line says of its reconstruction: pairs of names and values."""
+    said = (("resolution", scan.resolution), ("trim", scan.trim))
+    return tuple(pair for pair in said if pair[1] is not None)
 
 
 def _kept(scan, found, is_open, out) -> Outcome:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import safe_divide
-from ..clouds import frames
+from ..clouds import oriented_box
 from ..meshes import disc_parameters
 from ..parametric import NurbsFit, SplineBasis, fit_surface
 from ..shapes import Grid, PointCloud, PolygonMesh, TriangleMesh
@@ -53,25 +53,24 @@ def cloud_to_surface(
 ) -> NurbsFit:
     """A NURBS surface near the points of a sheet that can be seen from one side.
 
-    The points are looked at along the principal axis of least spread, on which no two
-    parts of the sheet may lie over each other; u and v are their places from 0 to 1
-    along the sides of the smallest rectangle (to a degree) around what is seen. Where
-    that has no points the surface only goes on smoothly. Its normal points to the side
-    of the cloud's normals, if it has any. Settings, **statuses** and derivatives as of
-    `parametric.fit_surface`; padding takes no part.
+    The points are looked at along the shortest side of `clouds.oriented_box`, on which
+    no two parts of the sheet may lie over each other; u and v are their places from 0
+    to 1 along the two others. Where the box has no points the surface only goes on
+    smoothly. Its normal points to the side of the cloud's normals, if it has any.
+    Settings, **statuses** and derivatives as of `parametric.fit_surface`; padding takes
+    no part.
     """
     clean = cloud.washed()
-    weights = clean.mask.astype(clean.points.dtype)
-    mean = safe_divide(weights @ clean.points, jnp.sum(weights))
-    gaps = weights[:, None] * (clean.points - mean)
-    spread = jax.lax.stop_gradient(gaps.T @ gaps)
-    size = jnp.trace(spread)
-    across, second, first = frames(spread / jnp.where(size > 0, size, 1))[1].T
+    box = jax.lax.stop_gradient(oriented_box(clean))
+    order = jnp.argsort(box.half_extents)
+    across, second, first = box.axes.T[order]
     # A right-handed frame whose third axis points outward.
     outward = across if clean.normals is None else jnp.sum(clean.normals, axis=0)
     second = second * jnp.where(jnp.dot(jnp.cross(first, second), outward) < 0, -1, 1)
-    flat = jax.lax.stop_gradient(gaps @ jnp.stack([first, second], axis=1))
-    uv = _in_rectangle(flat, clean.mask[:, None])
+    local = (clean.points - box.center) @ jnp.stack([first, second], axis=1)
+    uv = safe_divide(local, 2 * box.half_extents[order[:0:-1]]) + 0.5
+    uv = jax.lax.stop_gradient(jnp.where(clean.mask[:, None], uv, 0))
+    weights = clean.mask.astype(clean.points.dtype)
     return _fitted(clean.points, uv, num_control, degree, smoothing, weights)
 
 
@@ -91,21 +90,6 @@ def field_to_surface(
 ) -> NurbsFit:
     """`mesh_to_surface` where a field is zero inside of a grid (host)."""
     return mesh_to_surface(field_to_mesh(field, grid).mesh, num_control, **settings)
-
-
-def _in_rectangle(flat, real):
-    """The places [n, 2], from 0 to 1, in the smallest of the turned rectangles."""
-
-    def turned(angle):
-        c, s = jnp.cos(angle), jnp.sin(angle)
-        places = flat @ jnp.array([[c, -s], [s, c]])
-        low = jnp.min(jnp.where(real, places, jnp.inf), axis=0)
-        high = jnp.max(jnp.where(real, places, -jnp.inf), axis=0)
-        return jnp.where(real, safe_divide(places - low, high - low), 0), high - low
-
-    angles = jnp.linspace(0, jnp.pi / 2, 90, endpoint=False, dtype=flat.dtype)
-    areas = jax.lax.map(lambda angle: jnp.prod(turned(angle)[1]), angles)
-    return turned(angles[jnp.argmin(areas)])[0]
 
 
 def _fitted(points, uv, num_control, degree, smoothing, weights=None):

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 from ..shapes import Grid, TetrahedralMesh
 from ._cube import edges, faces
 from ._dual import find_dual
+from ._extract import extract
 from ._extraction import Capacity
 from ._flexicubes import (
     AbstractQuadSplit,
@@ -33,7 +34,7 @@ from ._flexicubes import (
     moved_nodes,
 )
 from ._marching_cubes import as_float
-from ._patch_tables import NO_FACE, edge_number, patch_tables
+from ._patch_tables import NO_FACE, edge_code, edge_number, patch_tables
 
 _DIAGONALS = Diagonals()
 _CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2] for c in range(8)])
@@ -66,9 +67,9 @@ class FlexiSolid(eqx.Module):
 
         Pure and differentiable; of use as long as the same nodes are inside.
         """
-        values, level = as_float(values, level)
-        given = (values, grid, weights, level, self.capacity, self.split)
-        surface = _surface(*given).vertices[: self.num_surface]
+        sizes = {"capacity": self.capacity, "split": self.split}
+        out = flexicubes(values, grid, weights, level, **sizes)
+        surface = out.extraction.mesh.vertices[: self.num_surface]
         corners = moved_nodes(jnp.asarray(self.nodes), grid, weights.offsets)
         vertices = _joined(surface, corners, jnp.asarray(self.around), jnp)
         return TetrahedralMesh(vertices, self.mesh.tetrahedra)
@@ -94,11 +95,10 @@ def flexicubes_solid(
     values, level = as_float(values, level)
     if weights is None:
         weights = FlexiWeights.zeros(grid.shape, values.dtype)
-    needed = jax.device_get(FlexiCubes(split=split).measure(values, level))
-    capacity = Capacity.holding(*(int(n) for n in jax.tree.leaves(needed)))
-    given = (values, grid, weights, level, capacity, split)
-    surface = _surface(*given).trim()
-    dual = jax.device_get(_dual(values, level, capacity, split))
+    out = extract(values, grid, level, method=FlexiCubes(weights, split))
+    needed = out.required_vertices, out.required_faces, out.required_cells
+    capacity, surface = Capacity.holding(*map(int, needed)), out.mesh
+    dual = jax.device_get(_dual(values, level, capacity))
     inside = np.asarray((values < level) & jnp.isfinite(values))
     cells = _Cells(inside, dual.patches, len(surface.vertices))
     found = [_behind_quads(np.asarray(surface.faces), dual, inside.shape, split, cells)]
@@ -115,16 +115,8 @@ def flexicubes_solid(
 
 
 @eqx.filter_jit
-def _surface(values, grid, weights, level, capacity, split):
-    out = flexicubes(values, grid, weights, level, capacity=capacity, split=split)
-    return out.extraction.mesh
-
-
-@eqx.filter_jit
-def _dual(values, level, capacity, split):
-    quads = max(capacity.faces // split.faces_per_quad, 1)
-    inner = Capacity(capacity.vertices, 2 * quads, capacity.cells)
-    return find_dual(values, level, inner, None)
+def _dual(values, level, capacity):
+    return find_dual(values, level, capacity, None)
 
 
 @eqx.filter_jit
@@ -158,16 +150,16 @@ class _Cells:
         self.corners = np.stack([cut(c) for c in _CORNERS], axis=-1)
         self.vertex = self._vertices(patches, num_surface)
         self.flipped = self._flipped()
-        self.place, self.patches = self._places()
+        self.place, self.extremes = self._places()
 
     def _vertices(self, patches, num_surface):
         """The surface vertex on every edge [x, y, z, 12] of the cells; -1 for none."""
         x, y, z = (n - 1 for n in self.shape)
         node, code = patches.node[:num_surface], patches.code[:, :num_surface]
         held = patches.held[:, :num_surface]
-        number = {low << 2 | axis: _number(low, axis) for low, axis in _EDGES}
         table = np.zeros(32, int)
-        table[list(number)] = list(number.values())
+        for edge in edges():
+            table[edge_code(edge)] = edge_number(edge)
         place = np.unravel_index(node, self.shape)
         cell = np.ravel_multi_index(place, (x, y, z), mode="clip")
         out = np.full((x * y * z, 12), -1, np.int64)
@@ -197,6 +189,7 @@ class _Cells:
         for f, ring in enumerate(faces()):
             across = (ring[::2], ring[1::2])
             joined += [(*ends, both(*ends) & (self.flipped == f)) for ends in across]
+        # No two of eight corners are further apart than four sweeps of all edges reach.
         for _ in range(4):
             for a, b, same in joined:
                 lower = np.minimum(label[..., a], label[..., b])
@@ -215,13 +208,6 @@ class _Cells:
         own = self.place_base + 8 * cell[..., None] + label
         most, least = (np.take_along_axis(x, label, -1) for x in (most, least))
         return np.where(most == least, most, own), (least, most)
-
-
-def _number(low, axis):
-    return edge_number((low, low | 1 << axis))
-
-
-_EDGES = [(a, (b - a).bit_length() - 1) for a, b in edges()]
 
 
 def _pair(shape, axis):
@@ -295,7 +281,7 @@ def _numbered(tetrahedra, cells):
     places = used[used >= cells.place_base]
     # Places of whole cells lie amid their corners, which must be there.
     cell, corner = np.divmod(places - cells.place_base, 8)
-    least, most = (x.reshape(-1, 8)[cell, corner] for x in cells.patches)
+    least, most = (x.reshape(-1, 8)[cell, corner] for x in cells.extremes)
     whole = most < 0
     at = np.stack(np.unravel_index(cell, cells.corners.shape[:3]), axis=-1)
     rows = np.ravel_multi_index(

@@ -65,8 +65,8 @@ def tessellate_quads(
         cells[corners == k][~again[corners == k]].reshape(-1, k).astype(np.int32)
         for k in (3, 4)
     ]
-    mesh = mesh_of(surface, uv, np.zeros((0, 3), np.int32))
-    return PolygonMesh(mesh.vertices, [g for g in groups if len(g)], mesh.attributes)
+    uv = jnp.asarray(uv, float)
+    return PolygonMesh(jax.vmap(surface)(uv), [g for g in groups if len(g)], {"uv": uv})
 
 
 def layout(domain: Domain, resolution: tuple[int, int]) -> Layout:

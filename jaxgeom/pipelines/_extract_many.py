@@ -41,7 +41,8 @@ def extract_many(
         balls = extract_many(jax.vmap(fields.Sphere)(jnp.array([0.3, 0.5])), grid)
     """
     method = MarchingCubes() if method is None else method
-    arrays, fixed = eqx.partition(fields, eqx.is_array)
+    device = lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x
+    arrays, fixed = eqx.partition(jax.tree.map(device, fields), eqx.is_array)
     b = _length(arrays, grid if fixed is None else None)
     dtype = jnp.result_type(grid.spacing, float)
     levels = np.broadcast_to(np.asarray(level, dtype), (b,))

@@ -11,16 +11,15 @@ from jaxtyping import Array, Float, Key
 from .._core import (
     RESULTS,
     GeometryError,
-    bucket,
     failure_where,
     first_failure,
     message,
 )
 from ..fields import AbstractField
-from ..learning import Adam, SurfaceLoss, train
-from ..shapes import PointCloud, stack
+from ..learning import Adam, SurfaceLoss, Trained, train
+from ..shapes import PointCloud
 from ..transforms import Similarity
-from ._prepare import unit_box
+from ._prepare import padded, unit_box
 
 
 class FittedField(eqx.Module):
@@ -75,15 +74,19 @@ def fit_field(
     Raises `GeometryError` for the clouds that `prepare` refuses.
     """
     ready = unit_box(cloud)
-    size = bucket(ready.cloud.points.shape[0])
-    unit = jax.tree.map(
-        lambda x: jnp.asarray(x[0]), stack([bare(ready)], capacity=size)
-    )
+    unit = padded(bare(ready))
     loss = SurfaceLoss() if loss is None else loss
     out = train(field, loss, unit, key=key, adam=adam, progress=progress)
     error = _error(out.model, unit)
     result = first_failure(out.result, failure_to_reach(error, rtol))
-    if throw and bool(result == RESULTS.diverged):
+    if throw:
+        check_trained(out)
+    return in_place(out.model, error, out.losses, result, ready)
+
+
+def check_trained(out: Trained) -> None:
+    """Raise `GeometryError` where training diverged."""
+    if bool(out.result == RESULTS.diverged):
         raise GeometryError(
             message(
                 "training must end with a finite loss below its start",
@@ -92,7 +95,6 @@ def fit_field(
                 "Lower Adam(rate=...), or pass throw=False to look at the field.",
             )
         )
-    return in_place(out.model, error, out.losses, result, ready)
 
 
 def bare(ready) -> PointCloud:
@@ -107,7 +109,7 @@ def failure_to_reach(error, rtol) -> RESULTS:
 
 def in_place(unit_field, error, losses, result, ready) -> FittedField:
     """A field of the unit box where the user's points are."""
-    placed = unit_field.transformed(_user_from_unit(ready))
+    placed = unit_field.transformed(user_from_unit(ready))
     width = np.asarray(error, float) * ready.scale
     return FittedField(placed, unit_field, width, losses, result, ready.notes)
 
@@ -122,7 +124,8 @@ def mean_miss(field, cloud) -> Float[Array, ""]:
 _error = eqx.filter_jit(mean_miss)
 
 
-def _user_from_unit(ready):
+def user_from_unit(ready) -> Similarity:
+    """The way from the unit box to the user's points."""
     dtype = ready.cloud.points.dtype
     return Similarity(
         jnp.asarray(ready.scale, dtype),

@@ -28,19 +28,16 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Float, Key
 
 from .._core import (
     RESULTS,
     GeometryError,
-    bucket,
     failure_where,
     first_failure,
     message,
     safe_divide,
     safe_norm,
-    safe_normalize,
 )
 from ..fields import AbstractField, Claims
 from ..learning import (
@@ -55,12 +52,14 @@ from ..learning import (
 )
 from ..reconstruction import AbstractKernel, Matern
 from ..reconstruction._stochastic import chance_inside, density_at_zero
-from ..shapes import PointCloud, stack
-from ._prepare import unit_box
+from ..shapes import PointCloud
+from ..transforms import Similarity
+from ._fit_field import bare, check_trained, user_from_unit
+from ._prepare import padded, unit_box
+from ._vector_process import MeanLoss, SpreadLoss, Vectors
 
 _MOST_POINTS = 8192
 _LENGTH = 0.2
-_DRAWN = 256
 _SMALL = 0.005
 _LEAST_SHARE = 0.1
 
@@ -106,7 +105,7 @@ class NeuralPosterior(AbstractField):
     Points are in the unit and the place of the scan, values in its unit (gradients
     follow unit normals), negative inside, zero on average at the samples.
 
-    - `mean`, `spread`: the networks, in the unit box. `middle`, `size`: of the scan.
+    - `mean`, `spread`: the networks, in the unit box; `user_from_unit`: where that is.
     - `mean_there`, `spread_there` [r]: what is taken off both, their means at the
       samples.
     - `explained`: the share of the squared covariance of V that J J'^T took off, about
@@ -118,15 +117,14 @@ class NeuralPosterior(AbstractField):
     spread: Spread
     mean_there: Float[Array, ""]
     spread_there: Float[Array, " r"]
-    middle: Float[Array, " 3"]
-    size: Float[Array, ""]
+    user_from_unit: Similarity
     explained: Float[Array, ""]
     losses: tuple[Float[Array, " s"], Float[Array, " s"]]
     result: RESULTS
     notes: tuple[str, ...] = eqx.field(static=True, default=())
 
     def evaluate(self, point):
-        return self.size * (self.mean(self._inside(point)) - self.mean_there)
+        return self._size * (self.mean(self._inside(point)) - self.mean_there)
 
     def claims(self):
         return Claims.unknown()
@@ -134,7 +132,7 @@ class NeuralPosterior(AbstractField):
     def factor(self, points: Float[Array, "m 3"]) -> Float[Array, "m r"]:
         """The rows phi(x): the covariance of the values at points is F F^T."""
         rows = jax.vmap(lambda x: self.spread(self._inside(x)))(points)
-        return self.size * (rows - self.spread_there)
+        return self._size * (rows - self.spread_there)
 
     def std(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The standard deviation at points."""
@@ -154,8 +152,12 @@ class NeuralPosterior(AbstractField):
         of the field."""
         return density_at_zero(jax.vmap(self)(points), self.std(points))
 
+    @property
+    def _size(self):
+        return self.user_from_unit.scale
+
     def _inside(self, point):
-        return (point - self.middle) / self.size
+        return self.user_from_unit.inverse().points(point)
 
 
 class DrawnField(AbstractField):
@@ -169,94 +171,6 @@ class DrawnField(AbstractField):
 
     def claims(self):
         return Claims.unknown()
-
-
-class _Vectors(eqx.Module):
-    """The posterior of V at places in the box, and the samples."""
-
-    places: Float[Array, "m 3"]
-    mean: Float[Array, "m 3"]
-    known: Float[Array, "m n"]
-    kernel: AbstractKernel
-    variance: Float[Array, ""]
-    points: Float[Array, "n 3"]
-    real: Bool[Array, " n"]
-
-    @staticmethod
-    def of(cloud, places, kernel, variance, noise) -> "_Vectors":
-        """With one Cholesky factorization of T."""
-        clean, real = cloud.washed(), cloud.mask
-        normals = safe_normalize(clean.normals)
-        real = real & (safe_norm(normals) > 0)
-        both = real[:, None] & real[None, :]
-        table = jnp.where(
-            both, variance * _table(kernel, clean.points, clean.points), 0
-        )
-        table = table + jnp.diag(jnp.where(real, noise**2, 1))
-        root = jnp.linalg.cholesky(table)
-        across = variance * _table(kernel, places, clean.points)
-        across = jnp.where(real, across, 0)
-        mean = across @ cho_solve((root, True), jnp.where(real[:, None], normals, 0))
-        known = solve_triangular(root, across.T, lower=True).T
-        return _Vectors(places, mean, known, kernel, variance, clean.points, real)
-
-    def covariance(self, rows, columns) -> Float[Array, "b c"]:
-        """s(x, x') of places by their numbers."""
-        prior = _table(self.kernel, self.places[rows], self.places[columns])
-        return self.variance * prior - self.known[rows] @ self.known[columns].T
-
-
-def _table(kernel, a, b):
-    gaps = a[:, None] - b[None]
-    return kernel.covariance(jnp.sum(gaps**2, axis=-1))
-
-
-def _pulled(values, real):
-    """The mean square at the samples."""
-    square = jnp.where(real, values**2, 0)
-    return safe_divide(jnp.sum(square), jnp.sum(real))
-
-
-class MeanLoss(eqx.Module):
-    """E |grad mu - m|^2 + screening mean mu(p)^2."""
-
-    screening: Float[Array, ""]
-
-    def __call__(self, field, data: _Vectors, key):
-        """The loss of a field, estimated with `key`."""
-        rows = jax.random.randint(key, (_DRAWN,), 0, len(data.places))
-        slopes = jax.vmap(jax.grad(field))(data.places[rows])
-        fit = jnp.mean(jnp.sum((slopes - data.mean[rows]) ** 2, axis=1))
-        return fit + self.screening * _pulled(jax.vmap(field)(data.points), data.real)
-
-
-class SpreadLoss(eqx.Module):
-    """E |J J'^T - s I|^2 / v^2 + screening mean |phi(p)|^2 / v."""
-
-    screening: Float[Array, ""]
-
-    def __call__(self, spread, data: _Vectors, key):
-        """The loss of phi, estimated with `key`."""
-        rows = jax.vmap(spread)(data.points)
-        pull = _pulled(safe_norm(rows), data.real) / data.variance
-        return self.fit(spread, data, key)[0] + self.screening * pull
-
-    def fit(self, spread, data, key):
-        """E |J J'^T - s I|^2 / v^2 and E |s I|^2 / v^2, from all pairs of two draws."""
-        keys = jax.random.split(key)
-        draw = lambda k: jax.random.randint(k, (_DRAWN,), 0, len(data.places))
-        rows, columns = map(draw, keys)
-        jacobian = jax.vmap(jax.jacfwd(spread))
-        first, second = (jacobian(data.places[i]) for i in (rows, columns))
-        # |G - s I|^2 = |G|^2 - 2 s trace G + 3 s^2, without the 9 entries of every G.
-        flat = lambda x: x.transpose(0, 2, 1).reshape(-1, x.shape[1])
-        products = flat(first) @ flat(second).T
-        wanted = data.covariance(rows, columns)
-        trace = jnp.einsum("bri,cri->bc", first, second)
-        nothing = jnp.mean(3 * wanted**2)
-        whole = nothing + jnp.sum(products**2) / _DRAWN**2
-        fit = whole - 2 * jnp.mean(wanted * trace)
-        return fit / data.variance**2, nothing / data.variance**2
 
 
 def neural_posterior(
@@ -306,47 +220,44 @@ def neural_posterior(
     """
     ready = unit_box(cloud)
     _check(ready.cloud, rank)
-    scale = ready.scale
-    kernel = Matern(_LENGTH * scale) if kernel is None else kernel
-    kernel = eqx.tree_at(lambda k: k.length, kernel, jnp.asarray(kernel.length / scale))
-    size = bucket(ready.cloud.points.shape[0])
-    bare = PointCloud(ready.cloud.points, ready.cloud.normals)
-    unit = jax.tree.map(lambda x: jnp.asarray(x[0]), stack([bare], capacity=size))
+    kernel = Matern(_LENGTH * ready.scale) if kernel is None else kernel
+    length = jnp.asarray(kernel.length / ready.scale)
+    kernel = eqx.tree_at(lambda k: k.length, kernel, length)
+    unit = padded(bare(ready))
     dtype = unit.points.dtype
     keys = jax.random.split(key, 6)
     reach = (1 + padding) / 2
     places = jax.random.uniform(keys[0], (num_places, 3), dtype, -reach, reach)
-    numbers = (jnp.asarray(x, dtype) for x in (variance, noise))
-    data = _vectors(unit, places, kernel, *numbers)
-    adam = Adam(rate=1e-3) if adam is None else adam
-    settings = {"adam": adam, "progress": progress}
-    pull = jnp.asarray(screening, dtype)
+    variance, noise, pull = (
+        jnp.asarray(x, dtype) for x in (variance, noise, screening)
+    )
+    data = _vectors(unit, places, kernel, variance, noise)
+    settings = {"adam": Adam(rate=1e-3) if adam is None else adam, "progress": progress}
     # Waves per unit, as the kernel has them.
-    band = {"bandwidth": 1 / (2 * math.pi * float(kernel.length))}
+    band = {"bandwidth": 1 / (2 * math.pi * float(length))}
     mean = NeuralField.fourier(key=keys[1], num_frequencies=64, **band)
     spread = Spread.fourier(rank, key=keys[2], **band)
-    first = train(mean, MeanLoss(pull), data, key=keys[3], **settings)
-    second = train(spread, SpreadLoss(pull), data, key=keys[4], **settings)
-    share = _explained(second.model, data, keys[5])
+    trained = (
+        train(mean, MeanLoss(pull), data, key=keys[3], **settings),
+        train(spread, SpreadLoss(pull), data, key=keys[4], **settings),
+    )
+    for out in trained if throw else ():
+        check_trained(out)
+    share = _explained(trained[1].model, data, keys[5])
     missed = failure_where(~(share >= _LEAST_SHARE), RESULTS.not_converged)
-    result = first_failure(first.result, second.result, missed)
-    if throw and bool(result == RESULTS.diverged):
-        raise GeometryError(
-            message(
-                "training must end with a finite loss below its start",
-                f"last losses {float(first.losses[-1]):.3g} and "
-                f"{float(second.losses[-1]):.3g}",
-                "Lower Adam(rate=...), or pass throw=False to look at the fields.",
-            )
-        )
-    there = _at_samples(first.model, second.model, data)
-    where = jnp.asarray(ready.center, dtype), jnp.asarray(scale, dtype)
-    losses = (first.losses, second.losses)
-    parts = (first.model, second.model, *there, *where, share, losses)
-    return NeuralPosterior(*parts, result, ready.notes)
+    models = [out.model for out in trained]
+    return NeuralPosterior(
+        *models,
+        *_at_samples(*models, data),
+        user_from_unit(ready),
+        share,
+        tuple(out.losses for out in trained),
+        first_failure(*(out.result for out in trained), missed),
+        ready.notes,
+    )
 
 
-_vectors = eqx.filter_jit(_Vectors.of)
+_vectors = eqx.filter_jit(Vectors.of)
 
 
 @eqx.filter_jit

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -73,6 +74,12 @@ def unit_box(cloud, *, weights=None) -> Prepared:
     unit = ((points - center) / scale).astype(dtype)
     boxed = PointCloud(unit, _cast(cloud.normals, dtype), None, cloud.attributes)
     return Prepared(boxed, weights, center, scale, cloud.points.dtype, tuple(notes))
+
+
+def padded(cloud: PointCloud) -> PointCloud:
+    """The cloud padded to its bucket: clouds of about one size share a program."""
+    batch = stack([cloud], capacity=bucket(cloud.points.shape[0]))
+    return jax.tree.map(lambda x: jnp.asarray(x[0]), batch)
 
 
 def _points_of(points):
@@ -171,10 +178,7 @@ def _with_normals(cloud, orientation):
     notes = notes_on_normals(cloud)
     if cloud.normals is not None:
         return cloud, notes
-    padded = jax.tree.map(
-        lambda x: x[0], stack([cloud], capacity=bucket(cloud.points.shape[0]))
-    )
-    oriented = _orient(orientation, padded)
+    oriented = _orient(orientation, padded(cloud))
     normals = np.asarray(oriented.normals)[: len(cloud.points)]
     return PointCloud(cloud.points, normals, None, cloud.attributes), notes
 

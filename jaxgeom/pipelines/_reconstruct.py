@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float
 from .._core import (
     RESULTS,
     GeometryError,
-    bucket,
     first_failure,
     message,
     runtime_token,
@@ -30,9 +29,9 @@ from ..meshes import (
     trim_by_attribute,
 )
 from ..reconstruction import FieldSolution, PoissonStats, ScreenedPoisson, spread
-from ..shapes import Grid, PointCloud, TriangleMesh, stack
+from ..shapes import Grid, PointCloud, TriangleMesh
 from ._memory import check_memory
-from ._prepare import prepare
+from ._prepare import padded, prepare
 
 EXTRACTOR = MarchingCubes(placement=Cubic(), ambiguity=AsymptoticDecider())
 
@@ -180,13 +179,10 @@ def check_resolution(resolution) -> int:
 
 def _padded(ready):
     """The cloud, and the weights, padded to a bucket so that programs are shared."""
-    size = bucket(ready.cloud.points.shape[0])
-    cloud = jax.tree.map(
-        lambda x: jnp.asarray(x[0]), stack([ready.cloud], capacity=size)
-    )
+    cloud = padded(ready.cloud)
     if ready.weights is None:
         return cloud, None
-    padding = size - len(ready.weights)
+    padding = cloud.mask.shape[0] - len(ready.weights)
     weights = np.pad(ready.weights.astype(cloud.points.dtype), (0, padding))
     return cloud, jnp.asarray(weights)
 

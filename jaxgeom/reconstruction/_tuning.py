@@ -82,14 +82,7 @@ def tune(
 
     Raises `GeometryError` for held-out points without normals.
     """
-    if held_out.normals is None:
-        raise GeometryError(
-            message(
-                "held-out points must have normals, which are what is predicted",
-                "normals=None",
-                "Set some points of the oriented cloud aside.",
-            )
-        )
+    _check(held_out)
 
     def settings_of(logarithms, factor=1.0):
         length, variance, noise = jnp.exp(logarithms)
@@ -129,3 +122,14 @@ def tune(
         found.steps,
         first_failure(blind, found.result),
     )
+
+
+def _check(held_out):
+    if held_out.normals is None:
+        raise GeometryError(
+            message(
+                "held-out points must have normals, which are what is predicted",
+                "normals=None",
+                "Set some points of the oriented cloud aside.",
+            )
+        )

@@ -250,6 +250,33 @@ def test_scans_without_a_target_are_reconstructed(tmp_path, capsys, oriented):
 
 
 @pytest.mark.slow
+def test_lines_have_their_own_resolution_and_trim(tmp_path):
+    """A finer mesh, and one that is open where half of the scan is missing."""
+    points = _lumps(400, 1)
+    outward = points / np.linalg.norm(points + 1e-9, axis=1, keepdims=True)
+    half = points[:, 0] < 0.3
+    save_cloud(tmp_path / "whole.ply", PointCloud(points, outward))
+    save_cloud(tmp_path / "half.ply", PointCloud(points[half], outward[half]))
+    line = lambda name, source, **own: json.dumps(
+        {"id": name, "source": str(tmp_path / source), "parameters": own}
+    )
+    lines = [
+        line("coarse", "whole.ply", resolution=24),
+        line("fine", "whole.ply", resolution=48),
+        line("open", "half.ply", trim=0.3),
+        line("closed", "half.ply"),
+    ]
+    manifest, out = tmp_path / "list.jsonl", tmp_path / "out"
+    manifest.write_text("\n".join(lines))
+    command = ["batch", str(manifest), "--out", str(out), "--resolution", "24"]
+    assert main(command) == 0
+    found = _states(out)
+    assert all(state["status"] == "ok" for state in found.values())
+    assert found["fine"]["faces"] > 3 * found["coarse"]["faces"]
+    assert found["closed"]["watertight"] and not found["open"]["watertight"]
+
+
+@pytest.mark.slow
 def test_a_warm_batch_compiles_nothing(work, tmp_path, monkeypatch, capsys):
     """The programs that `warm_up` counts are all that a batch needs."""
     _, manifest = work

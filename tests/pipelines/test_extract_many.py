@@ -52,6 +52,12 @@ def test_fields_samples_and_levels_agree(method, closed):
         _same(one, extract(value, GRID, **choices))
 
 
+def test_samples_of_numpy_are_taken():
+    values = np.stack([np.asarray(sample(Sphere(r), GRID)) for r in RADII[:2]])
+    for radius, one in zip(RADII, extract_many(values, GRID), strict=False):
+        _same(one, extract(sample(Sphere(radius), GRID), GRID))
+
+
 def test_what_is_no_batch_is_refused():
     wrong = [
         np.zeros((11, 11, 11)),

@@ -11,7 +11,7 @@ from jaxgeom import RESULTS, GeometryError, Grid, PointCloud
 from jaxgeom._core import name_of
 from jaxgeom.learning import Adam
 from jaxgeom.pipelines import neural_posterior
-from jaxgeom.pipelines._neural_posterior import _Vectors
+from jaxgeom.pipelines._vector_process import Vectors
 from jaxgeom.reconstruction import Matern, SquaredExponential, stochastic_poisson
 
 KEY = jax.random.key(5)
@@ -58,7 +58,7 @@ def test_the_vectors_are_those_of_dense_algebra(x64):
     places = np.random.default_rng(1).uniform(-0.7, 0.7, (30, 3))
     for kernel in (Matern(0.3), SquaredExponential(0.3)):
         numbers = jnp.asarray(0.4), jnp.asarray(0.15)
-        found = eqx.filter_jit(_Vectors.of)(
+        found = eqx.filter_jit(Vectors.of)(
             padded, jnp.asarray(places), kernel, *numbers
         )
         kept = np.arange(40) != 3
