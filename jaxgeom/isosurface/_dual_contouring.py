@@ -3,8 +3,9 @@
 Classify and compact as marching cubes does. Hermite data: every cut edge gets its
 crossing and its normal (`_hermite.py`). Place: a patch gets the point of its cell that
 fits the tangent planes of its crossings best (`_qef.py`), on a flat patch their mean,
-on an edge or a corner of the body the edge or the corner. Emit: a quad per cut edge,
-split where the surface is (`_dual.py`).
+on an edge or a corner of the body the edge or the corner; where the field is there to
+ask, also edges and corners that only the cells around see (`_features.py`). Emit: a
+quad per cut edge, split where the surface is (`_dual.py`).
 
 Ju, Losasso, Schaefer and Warren (2002); one vertex per patch and the flipped faces:
 Nielson (2004), Schaefer, Ju and Warren (2007).
@@ -19,6 +20,7 @@ from .._core import safe_normalize, stage
 from ..shapes import Grid
 from ._dual import AbstractDualMethod, Dual, dual_mesh, find_dual
 from ._extraction import Capacity, Extraction
+from ._features import take_features
 from ._hermite import CLEARANCE, Hermite, from_field, from_samples
 from ._marching_cubes import as_float, check_grid
 from ._patches import Patches, corner_indices
@@ -67,9 +69,11 @@ def dual_contouring(
 
     A vertex per surface patch of a cell, in the cell: the point x that minimises
     sum_i (n_i . (x - p_i))^2 over the crossings p_i and normals n_i of the patch, held
-    to their mean where the planes do not determine it. Edges of the mesh are shared by
-    exactly two faces, except along the sides of the grid, where the outer half cell has
-    no faces. Inside is values < level, strictly.
+    to their mean where the planes do not determine it. With `field`, a patch that does
+    not see an edge or a corner beside it uses the planes of the patches around, and its
+    vertex may then lie beyond one side of its cell, in a cell without surface. Edges of
+    the mesh are shared by exactly two faces, except along the sides of the grid, where
+    the outer half cell has no faces. Inside is values < level, strictly.
 
     Positions and normals have the derivatives of these formulas with respect to values,
     level, origin, spacing and the parameters of `field`; the faces have none.
@@ -96,8 +100,15 @@ def dual_contouring(
     dual = find_dual(values, level, capacity, token)
     hermite = hermite_data(field, values, dual, grid, level, token)
     weight = jnp.asarray(regularization, values.dtype)
-    place = lambda h, d, w: place_vertices(h, d, grid, w)
-    vertices, normals = stage(token, place, hermite, dual, weight)
+    size = grid.spacing / jnp.max(grid.spacing)
+    planes = stage(token, lambda h, p: patch_planes(h, p, size), hermite, dual.patches)
+    place = lambda p, w: in_cell(p, size, w)
+    local = stage(token, place, planes, weight)
+    if field is not None:
+        local = take_features(local, planes, weight, field, values, dual, grid, level)
+    corner = grid.origin + grid.spacing * corner_indices(dual.patches.node, grid.shape)
+    vertices = corner + jnp.max(grid.spacing) * local.T
+    normals = safe_normalize(planes.direction.T)
     return dual_mesh(dual, vertices, normals, hermite.t, grid, capacity, token)
 
 
@@ -108,17 +119,9 @@ def hermite_data(field, values, dual: Dual, grid, level, token) -> Hermite:
     return from_field(field, values, dual.edges, dual.inside, grid, level)
 
 
-def place_vertices(hermite: Hermite, dual: Dual, grid: Grid, weight):
-    """The vertex and the mean normal of every patch."""
-    patches = dual.patches
-    # Cells are fitted from their corner, in units of their widest side.
-    scale = jnp.max(grid.spacing)
-    size = grid.spacing / scale
-    planes = patch_planes(hermite, patches, size)
-    low, high = CLEARANCE * size, (1 - CLEARANCE) * size
-    local = minimize(planes, low, high, weight, STEPS)
-    corner = grid.origin + grid.spacing * corner_indices(patches.node, grid.shape)
-    return corner + scale * local.T, safe_normalize(planes.direction.T)
+def in_cell(planes: Planes, size, weight) -> Float[Array, "3 v"]:
+    """The vertex of every patch from the corner of its cell, which is of this size."""
+    return minimize(planes, CLEARANCE * size, (1 - CLEARANCE) * size, weight, STEPS)
 
 
 def patch_planes(hermite: Hermite, patches: Patches, size) -> Planes:

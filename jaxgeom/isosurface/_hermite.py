@@ -20,8 +20,8 @@ from ..shapes import Grid
 from ._placement import Linear
 from ._vertices import CutEdges, Samples, directions, positions
 
-# A dual vertex keeps this distance from the sides of its cell, a crossing from the
-# ends of its edge, in cells: faces have an area then.
+# A dual vertex keeps this distance from the sides of its cell, in cells: faces have an
+# area then.
 CLEARANCE = 1e-3
 
 _STEPS = 12
@@ -37,7 +37,7 @@ class Hermite(eqx.Module):
 def from_samples(values, edges: CutEdges, grid: Grid, level, token) -> Hermite:
     """Hermite data of sampled values."""
     samples = Samples(values, edges)
-    t = stage(token, lambda s, v: _held(Linear()(s, v)), samples, level)
+    t = stage(token, lambda s, v: jnp.clip(Linear()(s, v), 0, 1), samples, level)
     return Hermite(t, directions(t, samples, grid, token))
 
 
@@ -56,7 +56,7 @@ def from_field(
     start, stop = along(jnp.zeros_like(line)), along(jnp.ones_like(line))
     changes = jnp.isfinite(start) & jnp.isfinite(stop)
     changes = changes & ((start < 0) == inside) & ((stop < 0) != inside)
-    root = _held(_root(along, start, stop, lax.stop_gradient(changes), line))
+    root = _root(along, start, stop, lax.stop_gradient(changes), line)
     points = positions(root, edges, grid)
     gradient = jax.vmap(jax.grad(field))(points)
     sound = changes & jnp.all(jnp.isfinite(gradient), axis=-1)
@@ -69,17 +69,20 @@ def from_field(
 def _root(along, start, stop, changes, line):
     """The root of a function on every edge; `line` where it does not change sign."""
     bracket = (jnp.zeros_like(line), start, jnp.ones_like(line), stop)
-    found = _illinois(along, lax.stop_gradient(bracket))
+    other, found = _illinois(along, lax.stop_gradient(bracket))
     found = lax.stop_gradient(jnp.where(changes, found, line))
     miss, slope = jax.jvp(along, (found,), (jnp.ones_like(found),))
     moved = found - safe_divide(miss, lax.stop_gradient(slope))
     # Newton may leave a kink: then the bracket knows better.
-    near = changes & (jnp.abs(moved - found) < CLEARANCE)
-    return jnp.where(near, moved, jnp.where(changes, found, line))
+    between = (moved - found) * (moved - other) <= 0
+    near = changes & (between | (jnp.abs(moved - found) < CLEARANCE))
+    root = jnp.where(near, moved, jnp.where(changes, found, line))
+    return jnp.clip(root, 0, 1)
 
 
 def _illinois(along, bracket):
-    """Regula falsi; the value at an end that stays is halved."""
+    """The last bracket of regula falsi, its newer end second; the value at an end that
+    stays is halved."""
 
     def step(_, state):
         a, fa, b, fb = state
@@ -89,8 +92,5 @@ def _illinois(along, bracket):
         crossed = (fc < 0) != (fb < 0)
         return jnp.where(crossed, b, a), jnp.where(crossed, fb, fa / 2), c, fc
 
-    return lax.fori_loop(0, _STEPS, step, bracket)[2]
-
-
-def _held(t):
-    return jnp.clip(t, CLEARANCE, 1 - CLEARANCE)
+    other, _, newer, _ = lax.fori_loop(0, _STEPS, step, bracket)
+    return other, newer

@@ -86,6 +86,13 @@ def minimize(planes: Planes, low, high, weight, steps: int) -> Float[Array, "3 v
     return planes.mean + jnp.stack(lax.scan(fix_one_more, start, None, length=4)[0][2])
 
 
+def approach(planes: Planes, weight, steps: int) -> Float[Array, "3 v"]:
+    """The regularised least-squares points of the planes, anywhere."""
+    zero = jnp.zeros_like(planes.mean[0])
+    free, held = [zero + 1] * 3, [zero] * 3
+    return planes.mean + jnp.stack(_solve(planes, free, held, weight, steps))
+
+
 def _fix_worst(y, free, held, low, high):
     """The free coordinate that is furthest out of the box is held at its bound."""
     # Which bound is met is a choice: it has no derivative.

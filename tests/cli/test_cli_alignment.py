@@ -58,6 +58,7 @@ def test_register_prints_and_writes_the_motion(files, tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_scans_apart_exit_with_5_and_write_nothing(files, tmp_path, capsys):
     moved = tmp_path / "moved.ply"
     arguments = ["register", str(files / "away.ply"), str(files / "target.ply")]

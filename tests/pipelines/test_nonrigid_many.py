@@ -36,6 +36,7 @@ def _many():
     return nonrigid_many(icosphere(2), stack(_scans()), **SETTINGS)
 
 
+@pytest.mark.slow
 def test_each_is_as_alone_and_lies_on_its_scan():
     found, template = _many(), icosphere(2)
     each = [jax.tree.map(lambda x, i=i: x[i], found) for i in range(4)]

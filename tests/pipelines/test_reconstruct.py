@@ -188,6 +188,7 @@ def test_compiled_form_maps_over_ragged_clouds():
         )
 
 
+@pytest.mark.slow
 def test_gradient_of_the_volume_is_central_difference(x64):
     points, normals = _bumpy(600)
     method = ScreenedPoisson(screening=2.0, levels=1, rtol=1e-12, max_steps=200)

@@ -53,6 +53,7 @@ def _off(found):
     return np.abs(_matrix(found) - np.asarray(Rigid.exp(MOVE).matrix())).max()
 
 
+@pytest.mark.slow
 def test_points_alone_are_enough():
     source, target = _scans()
     found = _align(source, target)

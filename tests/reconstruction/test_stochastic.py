@@ -293,6 +293,7 @@ def test_trimming_keeps_what_was_scanned():
     assert np.sum(kept_height < -0.5) < 0.02 * np.sum(height < -0.5)
 
 
+@pytest.mark.slow
 def test_statuses_and_errors(x64):
     cloud, grid, _ = small()
     few_steps = dict(rtol=1e-6, max_steps=300)
