@@ -54,6 +54,7 @@ def _padded(points, size=4096):
 field_at = jax.jit(lambda body, points: jax.vmap(body)(points))
 
 
+@pytest.mark.slow
 def test_corners_and_edges_of_turned_boxes(tools):
     """Every corner is met to 1/1000 cell, whichever cells see its planes."""
     grid = box_grid()

@@ -116,6 +116,7 @@ def test_no_tetrahedron_of_a_ball_is_turned_over(x64):
     assert _sums(np.asarray(boundary.faces)) == _sums(np.asarray(surface.faces))
 
 
+@pytest.mark.slow
 def test_moved_vertices_and_their_derivatives(x64):
     """`moved` is the solid of other values as long as the signs stay."""
     values, weights = _noise(5), _weights(5, size=0.3)

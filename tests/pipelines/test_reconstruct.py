@@ -219,6 +219,7 @@ def _sampled(path, num):
     return mesh, jg.PointCloud(samples.points, samples.normals)
 
 
+@pytest.mark.slow
 def test_real_statue_of_two_hundred_points(data):
     _, cloud = _sampled(data / "meshes" / "nefertiti.ply", 200)
     out = jg.reconstruct(cloud, resolution=64)

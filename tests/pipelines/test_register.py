@@ -65,6 +65,7 @@ def test_points_alone_are_enough():
     np.testing.assert_array_equal(_matrix(again), _matrix(found))
 
 
+@pytest.mark.slow
 def test_far_from_the_origin():
     source, target = _scans()
     near = _align(source, target)
