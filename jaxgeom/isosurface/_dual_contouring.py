@@ -102,8 +102,7 @@ def dual_contouring(
     weight = jnp.asarray(regularization, values.dtype)
     size = grid.spacing / jnp.max(grid.spacing)
     planes = stage(token, lambda h, p: patch_planes(h, p, size), hermite, dual.patches)
-    place = lambda p, w: in_cell(p, size, w)
-    local = stage(token, place, planes, weight)
+    local = stage(token, in_cell, planes, size, weight)
     if field is not None:
         local = take_features(local, planes, weight, field, values, dual, grid, level)
     corner = grid.origin + grid.spacing * corner_indices(dual.patches.node, grid.shape)

@@ -2,7 +2,7 @@
 
 A corner may lie in a cell whose edges meet one or two of its three planes only, or in a
 cell of which all nodes are on one side. The cells around do see its planes. So every
-patch pools the planes of the patches that share a quad with it,
+patch pools its planes and those of the patches in its quads, once for each quad,
 
     H = sum n n^T,  r = sum n n . (p - c),  c the mean crossing of the patch itself,
 
@@ -11,14 +11,15 @@ its vertex, as near to c as the planes leave it. It is taken where
 
 - it lies in the cell of the patch, or beyond one side of it in a cell without surface,
 - the field says that it is on the surface,
-- the pooled normals turn: on smooth surfaces the own crossings are nearer.
+- the pooled normals have more directions than its own, or its vertex was held at a side
+  of the cell and they have two: on smooth surfaces the own crossings are nearer.
 
 A side of a cell toward a cell without surface has no cut edge. So the vertex stays in
 its quadrant around each cut edge of its patch, where the triangles of `_dual.py` face
 outward; and no other vertex of its quads can be in that cell.
 
-A vertex at a feature outside its cell: Kobbelt, Botsch, Schwanecke and Seidel (2001),
-section 4, who insert it in the cell.
+A vertex where the tangent planes meet, inside the cell or not: Kobbelt, Botsch,
+Schwanecke and Seidel (2001).
 """
 
 from collections.abc import Callable
@@ -35,6 +36,7 @@ from ._dual import Dual
 from ._hermite import CLEARANCE
 from ._patches import corner_indices
 from ._qef import Planes, approach, times
+from ._vertices import Samples
 
 # Tikhonov's steps and weight: three planes of which one has 1/50 of the crossings are
 # met but for rounding: (w / (1/50 + w))^4 = 6e-10.
@@ -100,15 +102,15 @@ def is_better(
 ):
     """Whether the candidates are allowed, on the surface, and see what `own` do not."""
     size = grid.spacing / jnp.max(grid.spacing)
-    place = (point / size[:, None]).T
+    place, aside = (point / size[:, None]).T, jnp.abs(own / size[:, None] - 0.5)
+    aside = jnp.any(aside >= 0.5 - 2 * CLEARANCE, axis=0)
     corner = corner_indices(dual.patches.node, grid.shape)
     found = jax.vmap(field)(grid.origin + grid.spacing * (corner + place)) - level
     near = jnp.abs(found) < _MISFIT * change
-    aside = jnp.abs(own / size[:, None] - 0.5) >= 0.5 - 2 * CLEARANCE
     # What the weight of the mean draws away from is not seen well.
     alone = num_planes(planes.normal, jnp.maximum(_TURN / 2, 5 * weight))
     seen = num_planes(pooled.normal, _TURN / 2)
-    more = (seen > alone) | ((seen > 1) & jnp.any(aside, axis=0))
+    more = (seen > alone) | ((seen > 1) & aside)
     return near & more & is_allowed(place, dual, grid.shape)
 
 
@@ -132,10 +134,8 @@ def pool(planes: Planes, values, dual: Dual, size) -> tuple[Planes, Float[Array,
     offset = planes.right + jnp.stack(times(planes.normal, planes.mean))
     own = Sums(number * planes.normal, number * offset, number)
     around = _at_edges(own, dual, size)
-    flat, stride = values.reshape(-1), (values.shape[1] * values.shape[2],)
-    stride = jnp.array((*stride, values.shape[2], 1), jnp.int32)[dual.edges.axis]
-    low = dual.edges.node
-    change = jnp.abs(flat.at[low + stride].get(mode="clip") - flat[low])
+    samples = Samples(values, dual.edges)
+    change = jnp.abs(samples.along(1) - samples.along(0))
 
     def add(state, slot):
         sums, largest = state
