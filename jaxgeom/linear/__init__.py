@@ -9,6 +9,7 @@ from ._interpolation import interpolate as interpolate
 from ._interpolation import splat as splat
 from ._interpolation import splat_gradient as splat_gradient
 from ._multigrid import Multigrid as Multigrid
+from ._nystrom import Nystrom as Nystrom
 from ._slab_solvers import SlabCosine as SlabCosine
 from ._slab_solvers import SlabMultigrid as SlabMultigrid
 from ._slab_solvers import solve_in_slabs as solve_in_slabs

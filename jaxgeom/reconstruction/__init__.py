@@ -24,6 +24,7 @@ from ._stochastic import StochasticPoisson as StochasticPoisson
 from ._stochastic import stochastic_poisson as stochastic_poisson
 from ._support import face_probability as face_probability
 from ._tuning import Tuned as Tuned
+from ._tuning import calibrate_values as calibrate_values
 from ._tuning import tune as tune
 from ._views import NextView as NextView
 from ._views import next_view as next_view

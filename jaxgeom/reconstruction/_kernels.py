@@ -117,30 +117,40 @@ class Spectrum(eqx.Module):
 
     def potential(self, v: Float[Array, "3 x y z"]) -> Float[Array, "x y z"]:
         """f with Laplacian f = div v and mean 0."""
-        spectra = jnp.fft.rfftn(v, axes=(1, 2, 3))
-        return self.back(-1j * jnp.sum(self.ascent * spectra, axis=0))
+        return self._field(jnp.fft.rfftn(v, axes=(1, 2, 3)))
 
     def field_from(self, sources: Float[Array, "3 x y z"]) -> Float[Array, "x y z"]:
         """Cov(f, v) sources."""
-        spectra = jnp.fft.rfftn(sources, axes=(1, 2, 3))
-        return self.back(
-            -1j * self._size() * self.power * jnp.sum(self.ascent * spectra, 0)
-        )
+        return self._field(self._spectra(sources))
 
     def vectors_from(self, source: Float[Array, "x y z"]) -> Float[Array, "3 x y z"]:
         """Cov(v, f) source, the transpose of `field_from`."""
         spectrum = self._size() * self.power * jnp.fft.rfftn(source)
         return jnp.stack([self.back(1j * a * spectrum) for a in self.ascent])
 
-    def variance_of(self, source: Float[Array, "x y z"]) -> Float[Array, ""]:
-        """source^T Cov(f, f) source."""
-        power = self.power * jnp.sum(self.ascent**2, axis=0)
-        spectrum = self._size() * power * jnp.fft.rfftn(source)
-        return jnp.vdot(source, self.back(spectrum))
+    def both_from(
+        self, sources: Float[Array, "3 x y z"], source: Float[Array, "x y z"]
+    ) -> tuple[Float[Array, "3 x y z"], Float[Array, "x y z"]]:
+        """Cov((v, f), (v, f)) of sources of v and one of f."""
+        pull = 1j * self._size() * self.power * jnp.fft.rfftn(source)
+        spectra = self._spectra(sources) + self.ascent * pull
+        v = jnp.fft.irfftn(spectra, s=self.shape, axes=(1, 2, 3))
+        return v, self._field(spectra)
+
+    def levels_from(self, source: Float[Array, "x y z"]) -> Float[Array, "x y z"]:
+        """Cov(f, f) source."""
+        power = self._size() * self.power * jnp.sum(self.ascent**2, axis=0)
+        return self.back(power * jnp.fft.rfftn(source))
 
     def back(self, spectrum):
         """The values of a transform."""
         return jnp.fft.irfftn(spectrum, s=self.shape)
+
+    def _spectra(self, sources):
+        return self._size() * self.power * jnp.fft.rfftn(sources, axes=(1, 2, 3))
+
+    def _field(self, spectra):
+        return self.back(-1j * jnp.sum(self.ascent * spectra, axis=0))
 
     def _size(self):
         x, y, z = self.shape

@@ -3,19 +3,24 @@
 The vector field v whose values at the samples are their normals is a Gaussian process,
 each component alone, n_p = v(x_p) + noise; the field f solves Laplacian f = div v on a
 grid that is one period. Both are linear, so that f given the points is Gaussian too.
-With W the trilinear interpolation at the samples, K the kernel (a convolution),
-T = W K W^T + noise^2, and A_d the map from v_d to f,
+With W the trilinear interpolation at the samples, K the kernel (a convolution) and A_d
+the map from v_d to f, the samples see H (v, f) = (W v_1, W v_2, W v_3), and where their
+places are believed too, screened, also P W f = 0 + noise, P subtracting the mean over
+the samples: the surface passes through them, at one level that nobody knows. With C the
+covariance of (v, f), that is K for each v_d, and f = sum_d A_d v_d,
 
-    alpha_d = T^-1 n_d,    mean f = sum_d A_d K W^T alpha_d
-    var f(x) = k_f(0) - sum_d c_d^T T^-1 c_d,    c_d = Cov(v_d(X), f(x)).
+    T = H C H^T + noise^2,    alpha = T^-1 (n_1, n_2, n_3, 0)
+    mean (v, f) = C H^T alpha,    var f(x) = c(x, x) - c^T T^-1 c,  c = H C e_f(x).
 
-Nothing is stored but fields on the grid: K is applied by Fourier transforms, T inverted
-by conjugate gradients. A sample of the posterior is a sample of the prior, moved by
-what its errors at the points predict (Matheron's rule). f has no mean: every field is
-anchored to be zero on average at the samples.
+Nothing is stored but fields on the grid: C is applied by Fourier transforms, T inverted
+by conjugate gradients, for which its largest eigenvalues are found once. A sample of
+the posterior is a sample of the prior, moved by what its errors at the points predict
+(Matheron's rule). f has no mean: every field is anchored to be zero on average at the
+samples.
 
-Sellan and Jacobson (2022), "Stochastic Poisson surface reconstruction"; Wilson et al.
-(2020), "Efficiently sampling functions from Gaussian process posteriors".
+Sellan and Jacobson (2022), "Stochastic Poisson surface reconstruction", and (2023),
+"Neural stochastic screened Poisson reconstruction"; Wilson et al. (2020), "Efficiently
+sampling functions from Gaussian process posteriors".
 """
 
 import equinox as eqx
@@ -23,16 +28,25 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.stats import norm
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
-from .._core import RESULTS, GeometryError, first_failure, message, safe_divide
-from ..linear import conjugate_gradients, interpolate, splat
+from .._core import (
+    RESULTS,
+    GeometryError,
+    failure_where,
+    first_failure,
+    message,
+    safe_divide,
+)
+from ..linear import interpolate
 from ..shapes import Grid, PointCloud
 from ._kernels import AbstractKernel, Matern, Spectrum
 from ._measured import usable_samples
+from ._observed import Observed
 
 _POINTS_TOGETHER, _SAMPLES_TOGETHER = 8, 4
 _SPACINGS = 3.0
+_RTOL, _RTOL_OF_VALUES = 1e-3, 1e-5
 
 
 class StochasticPoisson(eqx.Module):
@@ -43,14 +57,19 @@ class StochasticPoisson(eqx.Module):
     - `variance`: of each component of the vector field far from the points; a third is
       that of unit vectors of any direction.
     - `noise`: standard deviation of each component of the normals.
-    - `rtol`, `max_steps`: of the conjugate gradients.
+    - `value_noise`: standard deviation of the field at the points, so of their places
+      across the surface, in their unit; None: only the normals are believed.
+    - `rtol`, `max_steps`: of the conjugate gradients, None: 1e-3, and 1e-5 where values
+      are believed, whose systems are worse; `rank`: of their preconditioner.
     """
 
     kernel: AbstractKernel | None = None
     variance: Float[Array, ""] | float = 1 / 3
     noise: Float[Array, ""] | float = 0.1
-    rtol: float = 1e-3
-    max_steps: int = eqx.field(static=True, default=300)
+    value_noise: Float[Array, ""] | float | None = None
+    rtol: float | None = None
+    max_steps: int = eqx.field(static=True, default=1000)
+    rank: int = eqx.field(static=True, default=300)
 
     def __call__(self, cloud, grid, *, weights=None) -> "Posterior":
         """The posterior given an oriented cloud; see `stochastic_poisson`."""
@@ -66,28 +85,36 @@ class StochasticPoisson(eqx.Module):
         kernel = self.kernel
         if kernel is None:
             kernel = Matern(_SPACINGS * jnp.max(grid.spacing))
-        noise = jnp.full(samples.q.shape[0], self.noise, samples.q.dtype) ** 2
+        weight = jnp.ones(samples.q.shape[0], samples.q.dtype)
         if weights is not None:
             # A sample of weight 0 says nothing, and is left out.
-            noise = noise / jnp.where(weights > 0, weights, 1)
             used = samples.real & (weights > 0)
+            weight = jnp.where(used, weights, 1).astype(weight.dtype)
             samples = eqx.tree_at(lambda s: s.real, samples, used)
-        data = _Data(
+        normals = jnp.where(samples.real[:, None], samples.normals, 0).T
+        deviations, rows, rtol = [self.noise], normals, _RTOL
+        if self.value_noise is not None:
+            rtol = _RTOL_OF_VALUES
+            deviations = [self.noise] * 3 + [self.value_noise]
+            rows = jnp.concatenate([normals, jnp.zeros_like(normals[:1])])
+        rtol = rtol if self.rtol is None else self.rtol
+        data = Observed.of(
             Spectrum.of(kernel, self.variance, grid),
             samples.q,
             samples.real,
-            noise,
-            self.rtol,
-            self.max_steps,
+            weight,
+            jnp.stack([d**2 / weight for d in deviations]),
+            rank=self.rank,
+            rtol=rtol,
+            max_steps=self.max_steps,
         )
-        normals = jnp.where(samples.real[:, None], samples.normals, 0)
-        solved = jax.vmap(data.solve, in_axes=1)(normals)
-        ended = jnp.all(solved.residual <= self.rtol)
-        status = RESULTS.where(ended, RESULTS.successful, RESULTS.not_converged)
-        values = data.anchored(data.field_of(solved.value))
-        result = first_failure(samples.result, status)
+        solved = data.solve(rows)
+        late = ~jnp.all(solved.residual <= rtol)
+        values = data.anchored(data.fields(solved.value)[1])
+        late = failure_where(late, RESULTS.not_converged)
+        result = first_failure(samples.result, late)
         steps = jnp.max(solved.steps)
-        return Posterior(grid, values, data, normals, solved.value, steps, result)
+        return Posterior(grid, values, data, rows, solved.value, steps, result)
 
 
 def stochastic_poisson(
@@ -114,72 +141,21 @@ def stochastic_poisson(
     return StochasticPoisson(**settings)(cloud, grid, weights=weights)
 
 
-class _Data(eqx.Module):
-    """What was observed where, and the prior: all linear maps of the model."""
-
-    spectrum: Spectrum
-    q: Float[Array, "n 3"]
-    real: Bool[Array, " n"]
-    noise: Float[Array, " n"]
-    rtol: float
-    max_steps: int = eqx.field(static=True)
-
-    def at(self, values):
-        """Values at the samples, zero for padding."""
-        return jnp.where(self.real, interpolate(values, self.q), 0)
-
-    def spread(self, x):
-        """The transpose of `at`."""
-        return splat(jnp.where(self.real, x, 0), self.q, self.spectrum.shape)
-
-    def solve(self, b):
-        """T^-1 b."""
-        apply = lambda x: self.at(self.spectrum.smooth(self.spread(x))) + self.noise * x
-        # One over the diagonal of T, but for the interpolation.
-        scale = 1 / (self.spectrum.variance + self.noise)
-        return conjugate_gradients(
-            apply,
-            b,
-            rtol=self.rtol,
-            max_steps=self.max_steps,
-            preconditioner=lambda r: scale * r,
-        )
-
-    def solved(self, rows):
-        """T^-1 of every row; NaN where the residual is above the tolerance."""
-        out = jax.vmap(self.solve)(rows)
-        good = (out.residual <= self.rtol)[:, None]
-        return jnp.where(good, out.value, jnp.nan)
-
-    def field_of(self, alpha):
-        """The field [x, y, z] of the coefficients alpha [3, n]."""
-        return self.spectrum.field_from(jax.vmap(self.spread)(alpha))
-
-    def anchored(self, values):
-        """Less the mean at the samples."""
-        return values - safe_divide(jnp.sum(self.at(values)), jnp.sum(self.real))
-
-    def looking_at(self, q):
-        """The source whose product with a field is its anchored value at q."""
-        count = jnp.maximum(jnp.sum(self.real), 1).astype(self.q.dtype)
-        anchor = self.spread(jnp.ones_like(self.noise) / count)
-        return splat(jnp.ones(1, self.q.dtype), q[None], self.spectrum.shape) - anchor
-
-
 class Posterior(eqx.Module):
     """A Gaussian distribution of fields; itself the field of its mean.
 
     - `values`: [x, y, z] the mean at the nodes, negative inside, 0 on average at the
       samples. In the unit of the points, since the gradient follows unit normals.
+    - `rows`: [3 or 4, n] what was observed, `alpha`: T^-1 of it.
     - `steps`: of the slowest linear system of the mean. `result`: see
       `stochastic_poisson`.
     """
 
     grid: Grid
     values: Float[Array, "x y z"]
-    data: _Data
-    normals: Float[Array, "n 3"]
-    alpha: Float[Array, "3 n"]
+    data: Observed
+    rows: Float[Array, "r n"]
+    alpha: Float[Array, "r n"]
     steps: Int[Array, ""]
     result: RESULTS
 
@@ -189,54 +165,40 @@ class Posterior(eqx.Module):
 
     def std(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The standard deviation at points, exact up to `rtol`: three linear systems
-        for each of them; NaN where they did not converge."""
-        data = self.data
-
-        def variance(q):
-            source = data.looking_at(q)
-            seen = jax.vmap(data.at)(data.spectrum.vectors_from(source))
-            known = jnp.sum(seen * data.solved(seen))
-            return data.spectrum.variance_of(source) - known
-
+        for each of them, or one four times as large; NaN where they did not
+        converge."""
         q = self.grid.index_of(points)
+        variance = self.data.level_variance
         return _root(lax.map(variance, q, batch_size=_POINTS_TOGETHER))
 
     def samples(self, key: Key[Array, ""], num: int) -> Float[Array, "s x y z"]:
         """Fields [num, x, y, z] drawn from the posterior, at the nodes; NaN where a
         linear system did not converge."""
-        data, shape = self.data, self.grid.shape
+        data, spectrum = self.data, self.data.spectrum
 
         def one(key):
             field, noise = jax.random.split(key)
             dtype = self.values.dtype
-            white = jax.random.normal(field, (3, *shape), dtype)
-            error = jax.random.normal(noise, self.normals.shape, dtype)
-            v = jax.vmap(data.spectrum.color)(white)
-            seen = jax.vmap(data.at)(v).T + jnp.sqrt(data.noise)[:, None] * error
-            gap = jnp.where(data.real[:, None], self.normals - seen, 0)
-            alpha = data.solved(gap.T)
-            return data.anchored(data.spectrum.potential(v) + data.field_of(alpha))
+            white = jax.random.normal(field, (3, *self.grid.shape), dtype)
+            error = jax.random.normal(noise, self.rows.shape, dtype)
+            v = jax.vmap(spectrum.color)(white)
+            f = spectrum.potential(v)
+            seen = data.rows(v, f) + jnp.sqrt(data.noise) * error
+            gap = jnp.where(data.real, self.rows - seen, 0)
+            return data.anchored(f + data.fields(data.solved(gap))[1])
 
         keys = jax.random.split(key, num)
         return lax.map(one, keys, batch_size=min(num, _SAMPLES_TOGETHER))
 
     def normals_at(
         self, points: Float[Array, "m 3"]
-    ) -> tuple[Float[Array, "m 3"], Float[Array, " m"]]:
-        """The mean of the vector field at points, and the standard deviation of each of
-        its components (without noise; NaN where a linear system did not converge)."""
-        data, spectrum = self.data, self.data.spectrum
-        vectors = jax.vmap(lambda a: spectrum.smooth(data.spread(a)))(self.alpha)
-        q = self.grid.index_of(points)
+    ) -> tuple[Float[Array, "m 3"], Float[Array, "m 3"]]:
+        """The mean of the vector field at points, and the standard deviation of its
+        components (without noise; NaN where a linear system did not converge)."""
+        vectors, q = self.data.fields(self.alpha)[0], self.grid.index_of(points)
         mean = jax.vmap(lambda v: interpolate(v, q))(vectors).T
-
-        def variance(q):
-            source = splat(jnp.ones(1, q.dtype), q[None], spectrum.shape)
-            smooth = spectrum.smooth(source)
-            seen = data.at(smooth)
-            return jnp.vdot(source, smooth) - jnp.vdot(seen, data.solved(seen[None])[0])
-
-        return mean, _root(lax.map(variance, q, batch_size=3 * _POINTS_TOGETHER))
+        variance = self.data.vector_variance
+        return mean, _root(lax.map(variance, q, batch_size=_POINTS_TOGETHER))
 
     def probability_inside(self, points: Float[Array, "m 3"]) -> Float[Array, " m"]:
         """The probability that the field is negative at points."""

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from jaxgeom.fields import Camera
-from jaxgeom.reconstruction import next_view, solver_posterior, tune
+from jaxgeom.reconstruction import (
+    Matern,
+    StochasticPoisson,
+    calibrate_values,
+    next_view,
+    solver_posterior,
+    tune,
+)
 from jaxgeom.shapes import Grid, PointCloud
 
 GRID = Grid(jnp.full(3, -1.4), jnp.full(3, 0.2), (15, 15, 15))
@@ -60,21 +67,37 @@ def test_solver_posterior():
         _same(one, some(run(cloud)), atol=2e-3)
 
 
+def _check_held_out(run, numbers, rtol):
+    """Of run(cloud, held out): padding and batches change none of the numbers. Gives
+    the results of a batch and of each alone."""
+    found = run(_padded(_ball(60), 4, np.nan), _padded(_ball(20, 1), 3, 9.0))
+    _same(numbers(found), numbers(run(_ball(60), _ball(20, 1))), rtol=rtol)
+    clouds = [_padded(_ball(60), 4, 7e3), _padded(_ball(50, 2), 14, 7e3)]
+    held = [_padded(_ball(20, 1), 2, 7e3), _padded(_ball(22, 4), 0, 7e3)]
+    batched = _rows(jax.jit(jax.vmap(run))(_stacked(*clouds), _stacked(*held)))
+    alone = [run(*pair) for pair in zip(clouds, held, strict=True)]
+    for one, other in zip(batched, alone, strict=True):
+        _same(numbers(one), numbers(other), rtol=rtol)
+    return batched, alone
+
+
 @pytest.mark.slow
 def test_tune(x64):
     """In double precision, solved to the end: a search makes small errors large."""
     settings = {"length": 0.5, "num_likely": 12, "max_evaluations": 4, "rtol": 1e-9}
     run = jax.jit(lambda a, b: tune(a, GRID, b, **settings))
     numbers = lambda t: (t.settings.kernel.length, t.settings.noise, t.widening, t.loss)
-    plain = numbers(run(_ball(60), _ball(20, 1)))
-    found = numbers(run(_padded(_ball(60), 4, np.nan), _padded(_ball(20, 1), 3, 9.0)))
-    _same(found, plain, rtol=1e-4)
-    clouds = [_padded(_ball(60), 4, 7e3), _padded(_ball(50, 2), 14, 7e3)]
-    held = [_padded(_ball(20, 1), 2, 7e3), _padded(_ball(22, 4), 0, 7e3)]
-    batched = jax.jit(jax.vmap(run))(_stacked(*clouds), _stacked(*held))
-    for pair, one in zip(zip(clouds, held, strict=True), _rows(batched), strict=True):
-        _same(numbers(one), numbers(run(*pair)), rtol=1e-4)
-        assert int(one.steps) == int(run(*pair).steps)
+    batched, alone = _check_held_out(run, numbers, 1e-4)
+    for one, other in zip(batched, alone, strict=True):
+        assert int(one.steps) == int(other.steps)
+
+
+@pytest.mark.slow
+def test_calibrate_values(x64):
+    prior = StochasticPoisson(Matern(0.5))
+    run = jax.jit(lambda a, b: calibrate_values(prior, a, GRID, b, num_steps=3))
+    numbers = lambda c: (c.settings.value_noise, c.covered, c.result)
+    _check_held_out(run, numbers, 1e-6)
 
 
 @pytest.mark.slow

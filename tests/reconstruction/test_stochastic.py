@@ -1,5 +1,6 @@
 """The posterior over fields against closed forms, dense algebra and real scans."""
 
+import dataclasses
 import functools
 
 import jax
@@ -15,6 +16,7 @@ from jaxgeom.reconstruction import (
     Matern,
     SquaredExponential,
     StochasticPoisson,
+    calibrate_values,
     face_probability,
     next_view,
     probability_hit,
@@ -25,7 +27,7 @@ from jaxgeom.reconstruction import (
 from jaxgeom.shapes import Grid, PointCloud, TriangleMesh
 
 SHAPE = (8, 7, 9)
-SETTINGS = dict(noise=0.2, variance=0.4, rtol=1e-10, max_steps=200)
+SETTINGS = dict(noise=0.2, variance=0.4, rtol=1e-10, max_steps=200, rank=3)
 
 
 def small(seed=0, n=6, dtype=np.float64):
@@ -53,8 +55,9 @@ def dense_rows(grid, points):
     return out.reshape(len(points), -1)
 
 
-def dense_posterior(cloud, grid, points, kernel, noise, variance):
-    """Mean and covariance of the anchored field at points, by sums over frequencies."""
+def dense_covariance(cloud, grid, points, kernel, variance):
+    """Of (v at samples, anchored f at samples, anchored f at points), by sums over
+    frequencies: [4 n + m, 4 n + m]."""
     size = [n * h for n, h in zip(grid.shape, grid.spacing, strict=True)]
     whole = [np.fft.fftfreq(n, 1 / n) for n in grid.shape]
     k = np.stack(np.meshgrid(*whole, indexing="ij"), -1).reshape(-1, 3)
@@ -65,28 +68,47 @@ def dense_posterior(cloud, grid, points, kernel, noise, variance):
     nodes = np.asarray(grid.nodes()).reshape(-1, 3)
     waves = np.exp(1j * nodes @ k.T)
     square = np.where(np.arange(len(k)) > 0, np.sum(k**2, axis=1), np.inf)
-    odd = np.where(nyquist, 0, k)
-    cov = lambda w: (waves * w @ waves.conj().T).real
+    ascent = np.where(nyquist, 0, k).T / square
     at, to = dense_rows(grid, cloud.points), dense_rows(grid, points)
-    to = to - at.mean(0)
-    inverse = np.linalg.inv(at @ cov(rho) @ at.T + noise**2 * np.eye(len(at)))
-    mean, known = 0, 0
-    for d in range(3):
-        cross = to @ cov(-1j * odd[:, d] / square * rho) @ at.T
-        mean = mean + cross @ inverse @ np.asarray(cloud.normals)[:, d]
-        known = known + cross @ inverse @ cross.T
-    prior = to @ cov(rho * np.sum(odd**2, axis=1) / square**2) @ to.T
-    return mean, prior - known
+    looks = [*3 * [at], np.concatenate([at, to]) - at.mean(0)]
+    # What a wave of v_d is in v_1, v_2, v_3 and f; the waves of the three are apart.
+    shares = np.concatenate([np.eye(3)[:, :, None] + 0 * ascent[0], -1j * ascent[None]])
+    parts = [
+        np.concatenate(
+            [w @ (waves * r) for w, r in zip(looks, shares[:, d], strict=True)]
+        )
+        for d in range(3)
+    ]
+    return sum((part * rho @ part.conj().T).real for part in parts)
+
+
+def dense_posterior(cloud, grid, points, kernel, noise, variance, value_noise=None):
+    """Mean and covariance of the anchored field at points."""
+    n = len(cloud.points)
+    cov = dense_covariance(cloud, grid, points, kernel, variance)
+    seen = np.arange(3 * n if value_noise is None else 4 * n)
+    sigma = np.where(seen < 3 * n, noise, value_noise or 0)
+    asked = np.arange(4 * n, len(cov))
+    rows = np.concatenate([np.asarray(cloud.normals).T.ravel(), np.zeros(n)])[seen]
+    cross = cov[np.ix_(asked, seen)]
+    gain = cross @ np.linalg.inv(cov[np.ix_(seen, seen)] + np.diag(sigma**2))
+    return gain @ rows, cov[np.ix_(asked, asked)] - gain @ cross.T
 
 
 @pytest.mark.parametrize(
-    "kernel",
-    [Matern(1.1), pytest.param(SquaredExponential(0.8), marks=pytest.mark.slow)],
+    ("kernel", "value_noise"),
+    [
+        (Matern(1.1), None),
+        (Matern(1.1), 0.03),
+        pytest.param(SquaredExponential(0.8), None, marks=pytest.mark.slow),
+    ],
 )
-def test_mean_and_deviation_are_those_of_dense_algebra(x64, kernel):
+def test_mean_and_deviation_are_those_of_dense_algebra(x64, kernel, value_noise):
     cloud, grid, points = small()
-    found = _run(cloud, grid, kernel)
-    expected, cov = dense_posterior(cloud, grid, points, kernel, 0.2, 0.4)
+    found = _run(cloud, grid, kernel, value_noise)
+    expected, cov = dense_posterior(
+        cloud, grid, points, kernel, 0.2, 0.4, value_noise=value_noise
+    )
     assert found.result == RESULTS.successful
     np.testing.assert_allclose(jax.vmap(found)(points), expected, rtol=1e-7, atol=1e-9)
     std = np.sqrt(np.diag(cov))
@@ -106,8 +128,9 @@ def _std(posterior, points):
 
 
 @jax.jit
-def _run(cloud, grid, kernel):
-    return stochastic_poisson(cloud, grid, kernel=kernel, **SETTINGS)
+def _run(cloud, grid, kernel, value_noise=None):
+    settings = dict(SETTINGS, value_noise=value_noise)
+    return stochastic_poisson(cloud, grid, kernel=kernel, **settings)
 
 
 @pytest.mark.slow
@@ -300,10 +323,10 @@ def test_statuses_and_errors(x64):
     few = PointCloud(cloud.points[:2], cloud.normals[:2])
     run = lambda c, **s: stochastic_poisson(c, grid, kernel=Matern(1.1), **s).result
     assert run(few) == RESULTS.too_few_points
-    assert run(cloud, rtol=1e-12, max_steps=1) == RESULTS.not_converged
+    assert run(cloud, rtol=1e-12, max_steps=1, rank=0) == RESULTS.not_converged
     assert run(cloud, weights=jnp.ones(6)) == RESULTS.successful
     stopped = stochastic_poisson(
-        cloud, grid, kernel=Matern(1.1), max_steps=1, rtol=1e-9
+        cloud, grid, kernel=Matern(1.1), max_steps=1, rtol=1e-9, rank=0
     )
     assert np.isnan(stopped.std(cloud.points[:1])).all()
     known = stochastic_poisson(cloud, grid, kernel=Matern(1.1), noise=1e-9, **few_steps)
@@ -352,13 +375,48 @@ def test_tuned_intervals_hold_what_they_say():
     assert 0.3 < float(found.widening) < 0.95
     test = some(others)
     mean, std = found.settings(cloud, grid).normals_at(test.points)
-    wide = jnp.sqrt(std**2 + found.settings.noise**2)[:, None]
+    wide = jnp.sqrt(std**2 + found.settings.noise**2)
     covered = float(jnp.mean(jnp.abs(test.normals - mean) / wide < 1.6449))
     assert 0.85 < covered < 0.95
     before = float(
         jnp.mean(jnp.abs(test.normals - mean) / wide * found.widening < 1.6449)
     )
     assert before > covered
+
+
+@pytest.mark.slow
+def test_calibrated_places_are_as_far_off_as_they_are():
+    """Points off a ball by 0.03: the deviation is found, and the interval holds."""
+    rng = np.random.default_rng(4)
+    unit = rng.standard_normal((900, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    normals = unit + 0.1 * rng.standard_normal(unit.shape)
+    points = unit * (0.8 + 0.03 * rng.standard_normal((900, 1)))
+    some = lambda part: PointCloud(
+        *(jnp.asarray(x[part], jnp.float32) for x in (points, normals))
+    )
+    grid = Grid(jnp.full(3, -1.6), jnp.full(3, 0.2), (16, 16, 16))
+    cloud, held_out, others = some(slice(300)), some(slice(300, 500)), slice(500, 900)
+    prior = StochasticPoisson(Matern(0.6), noise=0.1)
+    run = jax.jit(lambda a, b, **to: calibrate_values(prior, a, grid, b, **to))
+    found = run(cloud, held_out)
+    settings = found.settings
+    assert found.result == RESULTS.successful
+    assert 0.02 < float(settings.value_noise) < 0.045
+    assert 0.895 < float(found.covered) < 0.93
+    assert run(cloud, held_out, highest=0.01).result == RESULTS.not_converged
+
+    @jax.jit
+    def covered(settings):
+        posterior, test = settings(cloud, grid), some(others).points
+        wide = jnp.sqrt(posterior.std(test) ** 2 + settings.value_noise**2)
+        return jnp.mean(jnp.abs(jax.vmap(posterior)(test)) < 1.6449 * wide)
+
+    assert 0.85 < float(covered(settings)) < 0.95
+    # Without them the same prior knows much less of where the surface is.
+    plain = dataclasses.replace(settings, value_noise=None)
+    std = jax.jit(lambda s: s(cloud, grid).std(cloud.points[:20]))
+    assert np.median(std(plain)) > 1.5 * np.median(std(settings))
 
 
 def test_the_next_view_looks_at_the_unknown_side():
