@@ -7,6 +7,7 @@ from ._components import components as components
 from ._host import from_host as from_host
 from ._host import host_zeros as host_zeros
 from ._maths import eigen_two as eigen_two
+from ._maths import masked_mean as masked_mean
 from ._maths import prefix_sum as prefix_sum
 from ._maths import safe_divide as safe_divide
 from ._maths import safe_norm as safe_norm

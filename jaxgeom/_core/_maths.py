@@ -28,6 +28,12 @@ def safe_divide(a, b):
     return jnp.where(nonzero, a, 0.0) / jnp.where(nonzero, b, 1.0)
 
 
+def masked_mean(values, mask):
+    """The mean of `values` where `mask`; 0 where there are none."""
+    total = jnp.sum(jnp.where(mask, values, 0))
+    return safe_divide(total, jnp.sum(mask).astype(total.dtype))
+
+
 def tangents_to(n: Float[Array, " 3"]) -> Float[Array, "2 3"]:
     """Two unit vectors at right angles to the unit vector n and to each other.
 

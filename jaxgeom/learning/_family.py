@@ -5,15 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from .._core import RESULTS, safe_normalize
+from .._core import RESULTS, masked_mean, safe_normalize
 from ..shapes import PointCloud
-from ._losses import (
-    Samples,
-    clamped_error,
-    drawn_points,
-    drawn_samples,
-    masked_mean,
-)
+from ._losses import Samples, clamped_error, drawn_points, drawn_samples
 from ._networks import Decoder, LatentField
 from ._training import Adam, number, train, train_jit
 

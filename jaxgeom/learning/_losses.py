@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from .._core import safe_divide, safe_norm, safe_normalize
+from .._core import masked_mean, safe_norm, safe_normalize
 from ..shapes import PointCloud
 from ._training import number
 
@@ -134,9 +134,3 @@ def drawn_samples(samples: Samples, num: int, *, key: Key[Array, ""]) -> Samples
     """`num` samples drawn at random (with repetition)."""
     rows = jax.random.randint(key, (num,), 0, samples.values.shape[-1])
     return Samples(samples.points[rows], samples.values[rows])
-
-
-def masked_mean(values, mask):
-    """The mean of `values` where `mask`; 0 where there are none."""
-    total = jnp.sum(jnp.where(mask, values, 0))
-    return safe_divide(total, jnp.sum(mask).astype(total.dtype))

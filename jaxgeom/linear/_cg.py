@@ -38,7 +38,9 @@ def conjugate_gradients(
 
     The derivative with respect to b and to everything that `operator` closes over is
     that of the exact solution (implicit function theorem): one more solve, whatever the
-    number of steps.
+    number of steps. Where a Hessian depends on the residual or the status, take
+    `jax.jacrev(jax.grad(f))`: `jax.hessian` raises an error about `out_axes`, since JAX
+    batches whatever a linear solve returns beside the solution.
 
     **Arguments:**
 

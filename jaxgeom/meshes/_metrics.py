@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._core import GeometryError, message, safe_divide, safe_normalize
+from .._core import GeometryError, masked_mean, message, safe_divide, safe_normalize
 from ..neighbors import BruteForce, build, closest_on_mesh, knn
 from ..shapes import PointCloud, TriangleMesh
 
@@ -141,12 +141,6 @@ def point_to_mesh(points: PointCloud | Array, mesh: TriangleMesh) -> PointToMesh
     mesh = jax.tree.map(jnp.asarray, mesh)
     closest = closest_on_mesh(mesh, cloud.points)
     return PointToMesh(closest.distances, closest.mask & cloud.mask)
-
-
-def masked_mean(values, mask):
-    """The mean of `values` where `mask`; 0 where there are none."""
-    total = jnp.sum(jnp.where(mask, values, 0))
-    return safe_divide(total, jnp.sum(mask).astype(total.dtype))
 
 
 def harmonic_mean(x, y):

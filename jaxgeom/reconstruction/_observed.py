@@ -10,19 +10,17 @@ it has one row of n numbers in place of four.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from .._core import safe_divide
-from ..linear import Nystrom, conjugate_gradients, interpolate, splat
+from ..linear import (
+    LinearSolution,
+    Nystrom,
+    conjugate_gradients,
+    interpolate,
+    splat,
+)
 from ._kernels import Spectrum
-
-
-class Solved(eqx.Module):
-    """T^-1 of some rows; `residual` and `steps` of each system."""
-
-    value: Float[Array, "m n"]
-    residual: Float[Array, " k"]
-    steps: Int[Array, " k"]
 
 
 class Observed(eqx.Module):
@@ -87,20 +85,16 @@ class Observed(eqx.Module):
         return jnp.concatenate([seen, level[None]])
 
     def sources(self, rows):
-        """H^T rows: sources of v [3, x, y, z], and one of f or None."""
+        """H^T rows: sources of v [3, x, y, z] and of f [x, y, z]."""
         vectors = jax.vmap(self.spread)(rows[:3])
         if not self.screened:
-            return vectors, None
+            return vectors, jnp.zeros_like(vectors[0])
         level = jnp.where(self.real, rows[3], 0)
         return vectors, self.spread(level - self.share * jnp.sum(level))
 
     def fields(self, rows):
         """C H^T rows: v [3, x, y, z] and f [x, y, z]."""
-        vectors, level = self.sources(rows)
-        if self.screened:
-            return self.spectrum.both_from(vectors, level)
-        v = jax.vmap(self.spectrum.smooth)(vectors)
-        return v, self.spectrum.field_from(vectors)
+        return self.spectrum.both_from(*self.sources(rows))
 
     def covariance(self, x):
         """H C H^T x for one row, or for all four."""
@@ -112,8 +106,8 @@ class Observed(eqx.Module):
         """The same in units of the noise."""
         return self.scale * self.covariance(self.scale * x)
 
-    def solve(self, rows) -> Solved:
-        """T^-1 rows."""
+    def solve(self, rows) -> LinearSolution:
+        """T^-1 rows [m, n]; residual and steps of each system [m], or [m / 4]."""
         own = self.scale**2 * self.noise
 
         def one(b):
@@ -126,16 +120,14 @@ class Observed(eqx.Module):
             )
 
         out = jax.vmap(one)(rows.reshape(-1, *self.noise.shape))
-        return Solved(
-            (self.scale * out.value).reshape(rows.shape), out.residual, out.steps
-        )
+        value = (self.scale * out.value).reshape(rows.shape)
+        return eqx.tree_at(lambda o: o.value, out, value)
 
     def solved(self, rows):
         """T^-1 rows; NaN where the residual is above the tolerance."""
         out = self.solve(rows)
-        good = (out.residual <= self.rtol)[:, None, None]
-        blocks = out.value.reshape(-1, *self.noise.shape)
-        return jnp.where(good, blocks, jnp.nan).reshape(rows.shape)
+        good = jnp.repeat(out.residual <= self.rtol, len(self.noise))
+        return jnp.where(good[:, None], out.value, jnp.nan)
 
     def anchored(self, values):
         """Less the mean at the samples."""
@@ -158,22 +150,18 @@ class Observed(eqx.Module):
         smooth = self.spectrum.smooth(source)
         if not self.screened:
             # One row for all three.
-            return jnp.full(
-                3, _least(_missed_alone, source, self, self.at(smooth)[None])
-            )
+            seen = self.at(smooth)[None]
+            return jnp.full(3, _least(_missed_alone, source, self, seen))
         # Cov(f, v_d) is minus its transpose.
-        levels, none = -self.spectrum.vectors_from(source), jnp.zeros_like(source)
-        alone = lambda d, x: jnp.stack([x if e == d else none for e in range(3)])
-        parts = [
-            _least(
-                _missed,
-                (alone(d, source), none),
-                self,
-                self.rows(alone(d, smooth), levels[d]),
-            )
-            for d in range(3)
-        ]
-        return jnp.stack(parts)
+        levels = -self.spectrum.vectors_from(source)
+
+        def along(e):
+            alone = lambda x: e[:, None, None, None] * x
+            seen = self.rows(alone(smooth), jnp.tensordot(e, levels, 1))
+            looks = (alone(source), jnp.zeros_like(source))
+            return _least(_missed, looks, self, seen)
+
+        return jax.vmap(along)(jnp.eye(3, dtype=q.dtype))
 
 
 @eqx.filter_custom_jvp
@@ -196,8 +184,7 @@ def _least_jvp(primals, tangents):
 
 def _missed(looks, data, x):
     """(e - H^T x)^T C (e - H^T x) + x^T noise x, e sources of v and f."""
-    known, pull = data.sources(x)
-    vectors, level = looks[0] - known, looks[1] if pull is None else looks[1] - pull
+    vectors, level = (e - h for e, h in zip(looks, data.sources(x), strict=True))
     v, f = data.spectrum.both_from(vectors, level)
     return jnp.vdot(vectors, v) + jnp.vdot(level, f) + jnp.sum(data.noise * x**2)
 

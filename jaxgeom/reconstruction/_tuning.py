@@ -13,6 +13,10 @@ interpolations in model-based geostatistics").
 Points beside edges lie far outside of a Gaussian, which widens it for all others: its
 central interval of 90 % then holds more, or, with few points, less. A last factor on
 all variances, which leaves the mean as it is, makes the interval hold what it says.
+
+How far the places of the points are believed is found apart: the field, 0 at points of
+the surface, has the deviation (s^2 + t^2)^(1/2) at held-out ones, t the value noise,
+which is the least for which the interval holds the share that it should.
 """
 
 import dataclasses
@@ -29,6 +33,7 @@ from .._core import (
     GeometryError,
     failure_where,
     first_failure,
+    masked_mean,
     message,
     safe_divide,
 )
@@ -86,7 +91,7 @@ def tune(
 
     - `cloud`, `grid`, `rtol`, `max_steps`: as in `stochastic_poisson`.
     - `held_out`: other points with normals, in no order; a few hundred. Each is a
-      linear system, the first `num_likely` are two in every step of the search.
+      linear system, the first `num_likely` are one in every step of the search.
     - `length`: of the kernel `Matern(length, smoothness)`, at the start; three spacings
       of the grid are usual.
 
@@ -121,7 +126,8 @@ def tune(
 
     found = descend(loss, start, rtol=_RTOL, max_steps=max_evaluations)
     apart = jnp.abs(errors(settings_of(found.value), len(points))[0])
-    widening = _excess(apart, there, coverage)
+    apart = jnp.where(there, apart, jnp.nan)
+    widening = jnp.nanquantile(apart, coverage) / norm.ppf((1 + coverage) / 2)
     blind = failure_where(~jnp.isfinite(widening), RESULTS.nonfinite_input)
     return Tuned(
         settings_of(found.value, widening),
@@ -160,11 +166,8 @@ def calibrate_values(
 ) -> Calibrated:
     """The least `value_noise` whose intervals hold held-out points.
 
-    The field should be 0 at points of the surface. Its deviation at a held-out point,
-    together with the value noise t, is (s_i(t)^2 + t^2)^(1/2): the share `coverage` of
-    the points has to lie within the central interval of that probability. By bisection
-    of the logarithm of t, since wild points leave no likelihood to trust; what the
-    settings say of normals stays.
+    By bisection of its logarithm, since a few wild points leave no likelihood to trust.
+    What the settings say of normals stays.
 
     **Arguments:**
 
@@ -175,45 +178,32 @@ def calibrate_values(
     - `lowest`, `highest`: a two hundredth and half of the largest spacing of the grid.
     """
     spacing = jnp.max(grid.spacing)
-    ends = (lowest, highest)
-    usual = (spacing / 200, spacing / 2)
-    low, high = (
-        jnp.log(u if e is None else e) for e, u in zip(ends, usual, strict=True)
-    )
+    low = jnp.log(spacing / 200 if lowest is None else lowest)
+    high = jnp.log(spacing / 2 if highest is None else highest)
     points, there = _places(held_out, grid)
+    within = norm.ppf((1 + coverage) / 2)
 
     def settings_of(logarithm):
         return dataclasses.replace(settings, value_noise=jnp.exp(logarithm), rtol=None)
 
-    def apart(logarithm):
-        """[m, 1] fields in units of their deviation."""
+    def covered(logarithm):
+        """The share within the interval; a field that was not found is not."""
         changed = settings_of(logarithm)
         posterior = changed(cloud, grid)
         wide = jnp.sqrt(posterior.std(points) ** 2 + changed.value_noise**2)
-        return jnp.abs(jax.vmap(posterior)(points) / wide)[:, None]
+        held = jnp.abs(jax.vmap(posterior)(points)) <= within * wide
+        return masked_mean(held.astype(wide.dtype), there[:, 0])
 
     def halve(_, ends):
         low, high = ends
         middle = (low + high) / 2
-        # A field that was not found holds nothing.
-        holds = _excess(apart(middle), there, coverage) <= 1
+        holds = covered(middle) >= coverage
         return jnp.where(holds, low, middle), jnp.where(holds, middle, high)
 
     least, most = lax.fori_loop(0, num_steps, halve, (low, high))
-    held = there & (apart(most) <= norm.ppf((1 + coverage) / 2))
-    count = jnp.sum(there).astype(low.dtype)
     found = (least > low) & (most < high)
-    return Calibrated(
-        settings_of(most),
-        safe_divide(jnp.sum(held).astype(low.dtype), count),
-        failure_where(~found, RESULTS.not_converged),
-    )
-
-
-def _excess(apart, there, coverage):
-    """The factor on deviations that makes their interval hold the share `coverage`."""
-    among = jnp.nanquantile(jnp.where(there, apart, jnp.nan), coverage)
-    return among / norm.ppf((1 + coverage) / 2)
+    lost = failure_where(~found, RESULTS.not_converged)
+    return Calibrated(settings_of(most), covered(most), lost)
 
 
 def _places(held_out, grid):

@@ -30,14 +30,18 @@ SHAPE = (8, 7, 9)
 SETTINGS = dict(noise=0.2, variance=0.4, rtol=1e-10, max_steps=200, rank=3)
 
 
+def unit_vectors(rng, num):
+    drawn = rng.standard_normal((num, 3))
+    return drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+
+
 def small(seed=0, n=6, dtype=np.float64):
     """A few samples in the middle of a box that is no cube, and queries."""
     rng = np.random.default_rng(seed)
     spacing = np.array([0.5, 0.6, 0.45])
     grid = Grid(np.array([-1.0, 0.3, 2.0], dtype), spacing.astype(dtype), SHAPE)
     inner = grid.origin + spacing * (1 + rng.random((n + 3, 3)) * (np.array(SHAPE) - 3))
-    normals = rng.standard_normal((n, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit_vectors(rng, n)
     cloud = PointCloud(jnp.asarray(inner[:n], dtype), jnp.asarray(normals, dtype))
     return cloud, grid, jnp.asarray(inner[n:], dtype)
 
@@ -56,8 +60,8 @@ def dense_rows(grid, points):
 
 
 def dense_covariance(cloud, grid, points, kernel, variance):
-    """Of (v at samples, anchored f at samples, anchored f at points), by sums over
-    frequencies: [4 n + m, 4 n + m]."""
+    """Of v and of the anchored f, at the samples and at points, by sums over
+    frequencies: [4, n + m, 4, n + m]."""
     size = [n * h for n, h in zip(grid.shape, grid.spacing, strict=True)]
     whole = [np.fft.fftfreq(n, 1 / n) for n in grid.shape]
     k = np.stack(np.meshgrid(*whole, indexing="ij"), -1).reshape(-1, 3)
@@ -70,7 +74,8 @@ def dense_covariance(cloud, grid, points, kernel, variance):
     square = np.where(np.arange(len(k)) > 0, np.sum(k**2, axis=1), np.inf)
     ascent = np.where(nyquist, 0, k).T / square
     at, to = dense_rows(grid, cloud.points), dense_rows(grid, points)
-    looks = [*3 * [at], np.concatenate([at, to]) - at.mean(0)]
+    look = np.concatenate([at, to])
+    looks = [look, look, look, look - at.mean(0)]
     # What a wave of v_d is in v_1, v_2, v_3 and f; the waves of the three are apart.
     shares = np.concatenate([np.eye(3)[:, :, None] + 0 * ascent[0], -1j * ascent[None]])
     parts = [
@@ -79,20 +84,23 @@ def dense_covariance(cloud, grid, points, kernel, variance):
         )
         for d in range(3)
     ]
-    return sum((part * rho @ part.conj().T).real for part in parts)
+    cov = sum((part * rho @ part.conj().T).real for part in parts)
+    return cov.reshape(4, len(look), 4, len(look))
 
 
 def dense_posterior(cloud, grid, points, kernel, noise, variance, value_noise=None):
-    """Mean and covariance of the anchored field at points."""
-    n = len(cloud.points)
+    """Mean [4, m] of v and of the anchored field at points, covariance [4, m, 4, m]."""
+    n, m = len(cloud.points), len(points)
     cov = dense_covariance(cloud, grid, points, kernel, variance)
-    seen = np.arange(3 * n if value_noise is None else 4 * n)
-    sigma = np.where(seen < 3 * n, noise, value_noise or 0)
-    asked = np.arange(4 * n, len(cov))
-    rows = np.concatenate([np.asarray(cloud.normals).T.ravel(), np.zeros(n)])[seen]
-    cross = cov[np.ix_(asked, seen)]
-    gain = cross @ np.linalg.inv(cov[np.ix_(seen, seen)] + np.diag(sigma**2))
-    return gain @ rows, cov[np.ix_(asked, asked)] - gain @ cross.T
+    sigma = np.array([noise] * 3 + ([] if value_noise is None else [value_noise]))
+    k = len(sigma)
+    rows = np.zeros((k, n))
+    rows[:3] = np.asarray(cloud.normals).T
+    seen = cov[:k, :n, :k, :n].reshape(k * n, k * n)
+    cross = cov[:, n:, :k, :n].reshape(4 * m, k * n)
+    gain = cross @ np.linalg.inv(seen + np.diag(np.repeat(sigma**2, n)))
+    known = (gain @ cross.T).reshape(4, m, 4, m)
+    return (gain @ rows.ravel()).reshape(4, m), cov[:, n:, :, n:] - known
 
 
 @pytest.mark.parametrize(
@@ -106,10 +114,15 @@ def dense_posterior(cloud, grid, points, kernel, noise, variance, value_noise=No
 def test_mean_and_deviation_are_those_of_dense_algebra(x64, kernel, value_noise):
     cloud, grid, points = small()
     found = _run(cloud, grid, kernel, value_noise)
-    expected, cov = dense_posterior(
+    means, covariance = dense_posterior(
         cloud, grid, points, kernel, 0.2, 0.4, value_noise=value_noise
     )
     assert found.result == RESULTS.successful
+    mean, std = jax.jit(lambda p, x: p.normals_at(x))(found, points)
+    np.testing.assert_allclose(mean, means[:3].T, rtol=1e-7, atol=1e-9)
+    variance = np.einsum("dmdm->md", covariance)
+    np.testing.assert_allclose(std, np.sqrt(variance[:, :3]), rtol=1e-6)
+    expected, cov = means[3], covariance[3, :, 3]
     np.testing.assert_allclose(jax.vmap(found)(points), expected, rtol=1e-7, atol=1e-9)
     std = np.sqrt(np.diag(cov))
     np.testing.assert_allclose(_std(found, points), std, rtol=1e-6)
@@ -141,7 +154,8 @@ def test_samples_have_the_mean_and_the_covariance(x64):
     fields = draw(found, jax.random.key(1))
     to = dense_rows(grid, points)
     values = np.asarray(fields).reshape(4000, -1) @ to.T
-    mean, cov = dense_posterior(cloud, grid, points, Matern(1.1), 0.2, 0.4)
+    means, covariance = dense_posterior(cloud, grid, points, Matern(1.1), 0.2, 0.4)
+    mean, cov = means[3], covariance[3, :, 3]
     # Five standard errors of 4000 draws.
     std = np.sqrt(np.diag(cov))
     assert np.all(np.abs(values.mean(0) - mean) < 5 * std / np.sqrt(4000))
@@ -158,8 +172,7 @@ def test_closed_forms_on_the_torus(x64):
     h = 2 * np.pi / n
     grid = Grid(jnp.zeros(3), jnp.full(3, h), (n,) * 3)
     rng = np.random.default_rng(3)
-    points, normals = 1.5 + 3 * rng.random((12, 3)), rng.standard_normal((12, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points, normals = 1.5 + 3 * rng.random((12, 3)), unit_vectors(rng, 12)
     queries = 1.2 + 3.5 * rng.random((20, 3))
     whole = np.arange(-12, 13)
     k = np.stack(np.meshgrid(whole, whole, whole, indexing="ij"), -1).reshape(-1, 3)
@@ -227,24 +240,37 @@ def test_vmap_is_the_loop(x64):
         np.testing.assert_allclose(got, np.stack(expected), rtol=1e-6, atol=1e-8)
 
 
-def test_derivatives_are_central_differences(x64):
+@pytest.mark.parametrize("believed", [False, True])
+def test_derivatives_are_central_differences(x64, believed):
+    """First ones, and along one line the second: deviations are least values."""
     cloud, grid, points = small()
 
-    @jax.jit
-    def scalar(moved, length, noise, at):
+    def scalar(moved, length, noise, value_noise, at):
         c = PointCloud(moved, cloud.normals)
         settings = {**SETTINGS, "noise": noise}
+        if believed:
+            settings["value_noise"] = value_noise
         found = stochastic_poisson(c, grid, kernel=Matern(length), **settings)
-        return jnp.sum(found.std(at)) + jnp.sum(jax.vmap(found)(at) ** 2)
+        mean, std = found.normals_at(at[:1])
+        first = jnp.sum(found.std(at)) + jnp.sum(jax.vmap(found)(at) ** 2)
+        return first + jnp.sum(mean * std)
 
-    at = (cloud.points, jnp.float64(1.1), jnp.float64(0.2), points)
-    slopes = jax.jit(jax.grad(scalar, argnums=(0, 1, 2, 3)))(*at)
+    at = (cloud.points, jnp.float64(1.1), jnp.float64(0.2), jnp.float64(0.1), points)
+    gradient = jax.jit(jax.grad(scalar, argnums=range(5)))
+    value = jax.jit(scalar)
     rng = np.random.default_rng(5)
-    for i, x in enumerate(at):
-        along, h = rng.standard_normal(np.shape(x)), 1e-5
-        moved = lambda s, i=i, a=along, x=x: scalar(*at[:i], x + s * a, *at[i + 1 :])
+    draw = [rng.standard_normal(np.shape(x)) for x in at]
+    slopes, h = gradient(*at), 1e-5
+    for i, (x, along) in enumerate(zip(at, draw, strict=True)):
+        moved = lambda s, i=i, a=along, x=x: value(*at[:i], x + s * a, *at[i + 1 :])
         expected = (moved(h) - moved(-h)) / (2 * h)
-        np.testing.assert_allclose(np.sum(slopes[i] * along), expected, rtol=2e-5)
+        np.testing.assert_allclose(
+            np.sum(slopes[i] * along), expected, rtol=2e-5, atol=1e-9
+        )
+    line = lambda t: scalar(at[0], *(x + t for x in at[1:4]), at[4])
+    slope = jax.jit(jax.grad(line))
+    bent = jax.jit(jax.grad(jax.grad(line)))(0.0)
+    np.testing.assert_allclose(bent, (slope(h) - slope(-h)) / (2 * h), rtol=1e-5)
 
 
 def test_a_view_of_what_is_unknown_scores_high_and_has_a_slope(x64):
@@ -291,8 +317,7 @@ def test_a_face_is_as_probable_as_planes_near_it():
 @pytest.mark.slow
 def test_trimming_keeps_what_was_scanned():
     rng = np.random.default_rng(1)
-    normals = rng.standard_normal((400, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = unit_vectors(rng, 400)
     normals = normals[normals[:, 1] > 0]
     center, radius = np.array([0.3, -0.2, 0.1]), 0.9
     cloud = PointCloud(
@@ -353,18 +378,21 @@ def test_statuses_and_errors(x64):
     )
 
 
+def parts(points, normals):
+    """From a slice to a cloud of these rows, in single precision."""
+    cloud = PointCloud(jnp.asarray(points, jnp.float32), jnp.float32(normals))
+    return lambda part: jax.tree.map(lambda x: x[part], cloud)
+
+
 @pytest.mark.slow
 def test_tuned_intervals_hold_what_they_say():
     """A few wild normals widen a Gaussian; the last factor corrects it."""
     rng = np.random.default_rng(2)
-    unit = rng.standard_normal((700, 3))
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    unit = unit_vectors(rng, 700)
     normals = unit + 0.05 * rng.standard_normal(unit.shape)
     wild = rng.random(700) < 0.06
     normals[wild] += rng.standard_normal((wild.sum(), 3))
-    some = lambda part: PointCloud(
-        *(jnp.asarray(x[part], jnp.float32) for x in (0.8 * unit, normals))
-    )
+    some = parts(0.8 * unit, normals)
     grid = Grid(jnp.full(3, -1.6), jnp.full(3, 0.2), (16, 16, 16))
     cloud, held_out, others = some(slice(300)), some(slice(300, 400)), slice(400, 700)
     found = jax.jit(lambda a, b: tune(a, grid, b, length=0.6, num_likely=80))(
@@ -388,13 +416,9 @@ def test_tuned_intervals_hold_what_they_say():
 def test_calibrated_places_are_as_far_off_as_they_are():
     """Points off a ball by 0.03: the deviation is found, and the interval holds."""
     rng = np.random.default_rng(4)
-    unit = rng.standard_normal((900, 3))
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    unit = unit_vectors(rng, 900)
     normals = unit + 0.1 * rng.standard_normal(unit.shape)
-    points = unit * (0.8 + 0.03 * rng.standard_normal((900, 1)))
-    some = lambda part: PointCloud(
-        *(jnp.asarray(x[part], jnp.float32) for x in (points, normals))
-    )
+    some = parts(unit * (0.8 + 0.03 * rng.standard_normal((900, 1))), normals)
     grid = Grid(jnp.full(3, -1.6), jnp.full(3, 0.2), (16, 16, 16))
     cloud, held_out, others = some(slice(300)), some(slice(300, 500)), slice(500, 900)
     prior = StochasticPoisson(Matern(0.6), noise=0.1)
