@@ -17,9 +17,9 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
-from jaxgeom.neighbors import CellList, HostTree, build, knn
+from jaxgeom.neighbors import HostTree, KdTree, build, knn
 
-BACKENDS = {"cells": CellList(), "host tree": HostTree()}
+BACKENDS = {"tree": KdTree(), "host tree": HostTree()}
 
 
 def clouds(mesh, n, shift):

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxgeom import PointCloud, Rigid, stack
-from jaxgeom.neighbors import AbstractBackend, CellList, HostTree
+from jaxgeom.neighbors import AbstractBackend, HostTree, KdTree
 from jaxgeom.normals import estimate
 from jaxgeom.pipelines import register
 from jaxgeom.registration import Method, Nearest, icp
@@ -152,7 +152,7 @@ class Ours(eqx.Module):
 
 
 OURS = {
-    "icp": Ours(CellList(NEIGHBORS), CellList()),
+    "icp": Ours(KdTree(), KdTree()),
     "icp, host tree": Ours(HostTree(), HostTree()),
 }
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core import safe_divide
-from ..neighbors import AbstractBackend, CellList, Neighbors, build, knn
+from ..neighbors import AbstractBackend, Neighbors, build, knn
 from ..shapes import PointCloud
 from ._frames import frames
 
@@ -17,13 +17,12 @@ def nearest_graph(
 ) -> Neighbors:
     """The k nearest points [n, k] of every point of a cloud, itself among them.
 
-    `backend` finds them (see `neighbors.build`): `CellList(k)` by default. Status and
-    masks as of `neighbors.knn`; padding finds nothing.
+    `backend` finds them, see `neighbors.build`. Status and masks are those of
+    `neighbors.knn`; padding finds nothing.
     """
     points = cloud.washed().points
-    backend = CellList(k) if backend is None else backend
     index = build(points, cloud.mask, backend=backend)
-    return knn(index, points, k, mask=cloud.mask)
+    return knn(index, points, k, mask=cloud.mask, groups=index.groups)
 
 
 def centered(cloud: PointCloud, near: Neighbors):

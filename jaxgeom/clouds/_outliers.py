@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._core import GeometryError, message
-from ..neighbors import AbstractBackend, CellList, build, knn
+from ..neighbors import AbstractBackend, build, knn
 from ..shapes import PointCloud
 from ._neighborhoods import nearest_graph
 
@@ -54,9 +54,13 @@ def radius_inliers(
     """
     _check_k(least)
     points = cloud.washed().points
-    backend = CellList(least + 1) if backend is None else backend
     index = build(points, cloud.mask, backend=backend)
-    near = knn(index, points, least + 1, mask=cloud.mask, max_distance=radius)
+    near = knn(
+        *(index, points, least + 1),
+        mask=cloud.mask,
+        max_distance=radius,
+        groups=index.groups,
+    )
     return near.mask[:, least]
 
 

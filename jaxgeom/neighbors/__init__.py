@@ -4,10 +4,11 @@ from ._backends import AbstractBackend as AbstractBackend
 from ._backends import AbstractIndex as AbstractIndex
 from ._brute import BruteForce as BruteForce
 from ._brute import BruteIndex as BruteIndex
-from ._cells import CellIndex as CellIndex
-from ._cells import CellList as CellList
+from ._groups import kd_groups as kd_groups
 from ._host import HostIndex as HostIndex
 from ._host import HostTree as HostTree
+from ._kd import KdIndex as KdIndex
+from ._kd import KdTree as KdTree
 from ._knn import Neighbors as Neighbors
 from ._knn import build as build
 from ._knn import knn as knn

@@ -12,11 +12,13 @@ class AbstractIndex(eqx.Module):
     """Points prepared for repeated searches.
 
     `points` are those given (gradients flow through them), `mask` is True for those
-    that may be found.
+    that may be found, `groups` are these in groups that lie together, and near the next
+    one (n for padding), if they are known.
     """
 
     points: eqx.AbstractVar[Float[Array, "n 3"]]
     mask: eqx.AbstractVar[Bool[Array, " n"]]
+    groups: eqx.AbstractVar[Int[Array, "g s"] | None]
 
     @abstractmethod
     def search(
@@ -24,11 +26,13 @@ class AbstractIndex(eqx.Module):
         queries: Float[Array, "q 3"],
         active: Bool[Array, " q"],
         k: int,
-        reach: Float[Array, ""],
+        reach: Float[Array, " q"],
+        groups: Int[Array, "g s"] | None,
     ) -> Int[Array, "q k"]:
         """The k nearest points, nearest first, with squared distance up to `reach`.
 
-        Missing ones are n. Rows that are not `active` may hold anything.
+        Missing ones are n. Rows that are not `active` may hold anything. `groups`
+        are the queries in groups that lie together (q for padding), or None.
         """
 
 

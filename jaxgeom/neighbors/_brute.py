@@ -14,13 +14,16 @@ class BruteIndex(AbstractIndex):
     points: Float[Array, "n 3"]
     mask: Bool[Array, " n"]
     tile: int = eqx.field(static=True)
+    groups: None = None
 
     @eqx.filter_jit
-    def search(self, queries, active, k, reach):
+    def search(self, queries, active, k, reach, groups):
         points, mask = usable(self.points, self.mask)
         n = points.shape[0]
         return in_tiles(
-            lambda q: _nearest(q, points, mask, k, reach, n), queries, self.tile
+            lambda rows: _nearest(*rows, points, mask, k, n),
+            (queries, reach),
+            self.tile,
         )
 
 
@@ -33,10 +36,10 @@ class BruteForce(AbstractBackend):
         return BruteIndex(points, mask, self.tile)
 
 
-def _nearest(queries, points, mask, k, reach, n):
+def _nearest(queries, reach, points, mask, k, n):
     # Differences, not |q|^2 + |p|^2 - 2 q.p, which rounds to wrong neighbors.
     square = sum((queries[:, d, None] - points[:, d]) ** 2 for d in range(3))
     square = jnp.where(mask, square, jnp.inf)
     negative, index = jax.lax.top_k(-square, min(k, n))
-    index = jnp.where((-negative <= reach) & (negative > -jnp.inf), index, n)
+    index = jnp.where((-negative <= reach[:, None]) & (negative > -jnp.inf), index, n)
     return jnp.pad(index, ((0, 0), (0, k - min(k, n))), constant_values=n)

@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._morton import curve
+from ._groups import kd_groups
 from ._packets import AbstractVisit, walk
 from ._surface import SurfaceIndex
 
 # Numbers of a child: center, far distance squared, moments of order 1, 2 and 3.
 _PER_CHILD = 23
+_PACKET = 16
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _TRIPLES = tuple((i, j, k) for i in range(3) for j in range(i, 3) for k in range(j, 3))
 
@@ -51,8 +52,8 @@ def fast_winding(
     corners = jnp.where(real, index.packed, 0)
     leaves = corners.reshape(9, -1).T.reshape(-1, 9 * leaf)
     visit = WindingVisit(_moments(index.tree, corners, beta), leaves)
-    order = curve(points, jnp.ones(points.shape[0], bool))
-    total = walk(visit, points, order, jnp.zeros(points.shape[0], points.dtype))
+    groups = kd_groups(points, jnp.ones(points.shape[0], bool), _PACKET)
+    total = walk(visit, points, groups, jnp.zeros(points.shape[0], points.dtype))
     return total / (4 * np.pi)
 
 

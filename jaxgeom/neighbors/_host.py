@@ -20,8 +20,9 @@ class HostIndex(AbstractIndex):
     points: Float[Array, "n 3"]
     mask: Bool[Array, " n"]
     workers: int = eqx.field(static=True)
+    groups: None = None
 
-    def search(self, queries, active, k, reach):
+    def search(self, queries, active, k, reach, groups):
         points, mask = usable(self.points, self.mask)
         shape = jax.ShapeDtypeStruct((queries.shape[0], k), jnp.int32)
         find = lambda *arrays: _find(*map(np.asarray, arrays), k, self.workers)
@@ -48,16 +49,19 @@ class HostTree(AbstractBackend):
 def _find(points, mask, queries, active, reach, k, workers):
     out = np.full((len(queries), k), len(points), np.int32)
     real = np.flatnonzero(mask)
-    if len(real) == 0 or reach < 0 or not active.any():
+    active = active & (reach >= 0)
+    if len(real) == 0 or not active.any():
         return out
     tree = _grown(points[real].tobytes(), points.dtype)
     # scipy wants distances below its bound, and `reach` is a rounded square.
     slack = 1 + 2 * np.finfo(points.dtype).eps
-    bound = np.sqrt(reach, dtype=np.float64) * slack + np.finfo(points.dtype).tiny
+    bound = np.sqrt(reach[active], dtype=np.float64) * slack
+    bound = bound + np.finfo(points.dtype).tiny
     ranks = np.arange(1, k + 1)
-    _, near = tree.query(
-        queries[active], ranks, distance_upper_bound=bound, workers=workers
+    distances, near = tree.query(
+        queries[active], ranks, distance_upper_bound=bound.max(), workers=workers
     )
+    near = np.where(distances < bound[:, None], near, len(real))
     out[active] = np.append(real, len(points))[near]
     return out
 

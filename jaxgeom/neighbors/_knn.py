@@ -14,7 +14,7 @@ from .._core import (
     safe_norm,
 )
 from ._backends import AbstractBackend, AbstractIndex
-from ._cells import CellList
+from ._kd import KdTree
 
 
 class Neighbors(eqx.Module):
@@ -39,16 +39,16 @@ def build(
 ) -> AbstractIndex:
     """The search structure of `points` [n, 3]; only those where `mask` are ever found.
 
-    `backend` is `CellList(neighbors=k)`, best where k is about the number of neighbors
-    asked for later (1 by default), `BruteForce()` for up to about a thousand points, or
-    `HostTree()`, scipy's k-d tree, for a CPU.
+    `backend` is `KdTree()` by default, `BruteForce()` for up to about a thousand
+    points, `CandidateLists()` for points that are searched very often, or `HostTree()`,
+    scipy's k-d tree, for a CPU.
     Points that are not finite are never found. Raises `GeometryError` for wrong shapes.
     """
     check_shape("points", points, (None, 3))
     _check_some(points)
     mask = jnp.ones(points.shape[0], bool) if mask is None else jnp.asarray(mask)
     check_shape("mask", mask, (points.shape[0],))
-    backend = CellList() if backend is None else backend
+    backend = KdTree() if backend is None else backend
     return backend.build(jnp.asarray(points), mask)
 
 
@@ -58,7 +58,8 @@ def knn(
     k: int,
     *,
     mask: Bool[Array, " q"] | None = None,
-    max_distance: Float[Array, ""] | float = jnp.inf,
+    max_distance: Float[Array, "*q"] | float = jnp.inf,
+    groups: Int[Array, "g s"] | None = None,
 ) -> Neighbors:
     """The exact k nearest points of every query: |q - p_1| <= |q - p_2| <= ...
 
@@ -67,7 +68,11 @@ def knn(
     - `queries`: [q, 3], in the unit of the points.
     - `k`: how many, a static int of at least 1.
     - `mask`: [q], False for padding among the queries, which finds nothing.
-    - `max_distance`: farther points are not neighbors (a point at it is).
+    - `max_distance`: farther points are not neighbors (a point at it is); one number,
+      or one for each query.
+    - `groups`: all rows of the queries, in groups that lie together, where they are
+      known: `index.groups` for the points of the index, or those of `kd_groups`. It
+      saves the time to find them, and changes nothing else.
 
     Distances are differentiable in queries and points, with gradient zero where they
     are zero; the indices are constants. Raises `GeometryError` for wrong shapes or k.
@@ -84,9 +89,11 @@ def knn(
     active = jnp.all(jnp.isfinite(fixed), axis=-1)
     active = active if mask is None else active & mask
     gate = jax.lax.stop_gradient(jnp.asarray(max_distance, fixed.dtype))
+    gate = jnp.broadcast_to(gate, active.shape)
     still = jax.lax.stop_gradient(index)
     clean = jnp.where(active[:, None], fixed, 0)
-    indices = still.search(clean, active, k, jnp.where(gate < 0, -1, gate * gate))
+    reach = jnp.where(gate < 0, -1, gate * gate)
+    indices = still.search(clean, active, k, reach, groups)
     indices = jnp.where(active[:, None], indices, n)
     found = indices < n
     there = index.points[jnp.where(found, indices, 0)]

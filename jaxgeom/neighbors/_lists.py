@@ -14,8 +14,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ._backends import AbstractBackend, AbstractIndex, in_tiles, usable
 from ._brute import BruteForce
-from ._cells import CellIndex, CellList, Near, cell_id, cell_of, search_in_tree
-from ._tree import Nearest, insert
+from ._kd import KdIndex, KdTree
+from ._morton import bounds
+from ._nearest import Nearest, inserted
 
 # The grid reaches beyond the points by this share of their extent.
 _MARGIN = 0.1
@@ -29,6 +30,13 @@ _MOST_CELLS = 2**18
 _TILE = 2**15
 
 
+class Near(eqx.Module):
+    """The k nearest so far, and if that is certain."""
+
+    items: Int[Array, "q k"]
+    certain: Bool[Array, " q"]
+
+
 class ListIndex(AbstractIndex):
     """Points, and the candidates of every cell of a grid about them.
 
@@ -38,7 +46,8 @@ class ListIndex(AbstractIndex):
 
     points: Float[Array, "n 3"]
     mask: Bool[Array, " n"]
-    rest: CellIndex
+    rest: KdIndex
+    groups: Int[Array, "g s"]
     low: Float[Array, " 3"]
     width: Float[Array, ""]
     counts: Int[Array, " 3"]
@@ -46,23 +55,23 @@ class ListIndex(AbstractIndex):
     items: Int[Array, "c m"]
 
     @eqx.filter_jit
-    def search(self, queries, active, k, reach):
+    def search(self, queries, active, k, reach, groups):
         if k > min(_MANY, self.items.shape[1]):
-            return self.rest.search(queries, active, k, reach)
+            return self.rest.search(queries, active, k, reach, groups)
         near = self.from_lists(queries, k, reach)
         doubtful = active & ~near.certain
         count = jnp.sum(doubtful)
         ways = (_as_found, _with_few_again, _with_many_again)
         way = jnp.where(count > min(_FEW, queries.shape[0]), 2, jnp.minimum(count, 1))
-        again = [lambda *args, f=f: f(self, *args, k, reach) for f in ways]
+        again = [lambda *args, f=f: f(self, *args, k, reach, groups) for f in ways]
         return jax.lax.switch(way, again, queries, doubtful, near)
 
     def from_lists(self, queries, k, reach) -> Near:
         """The k nearest of the candidates."""
         n, m = self.points.shape[0], self.items.shape[1]
-        cell = cell_of(queries, self.low, self.width, self.counts)
+        cell = _cell_of(queries, self.low, self.width, self.counts)
         center = self.low + (cell + 0.5) * self.width
-        row = cell_id(cell.T, self.counts)
+        row = _cell_id(cell.T, self.counts)
         # Candidates first: what is compared lies side by side for all queries.
         entry = self.table.at[row].get(mode="promise_in_bounds").T
         axis = lambda d: entry[d * m : (d + 1) * m]
@@ -73,42 +82,43 @@ class ListIndex(AbstractIndex):
         best = Nearest(
             jnp.full(rows, jnp.inf, squares.dtype), jnp.zeros(rows, jnp.int32)
         )
-        take = lambda j, best: insert(best, squares[j], j)
+        take = lambda j, best: inserted(best, squares[j], j)
         best = jax.lax.fori_loop(0, m, take, best)
         there = (best.squares <= reach) & (best.squares < jnp.inf)
-        found = jnp.where(there, self.items[row, best.items], n).T
+        found = jnp.where(there, self.items[row, best.slots], n).T
         away = jnp.sqrt(jnp.sum((queries - center) ** 2, axis=1))
         limits = jnp.minimum(best.squares[-1], reach)
         size = jnp.max(jnp.abs(queries), axis=1) + jnp.max(jnp.abs(self.low))
         rounding = 32 * jnp.finfo(queries.dtype).eps * size
         certain = jnp.sqrt(limits) + away + rounding < entry[-1]
-        return Near(found, limits, certain)
+        return Near(found, certain)
 
 
-def _as_found(index, queries, doubtful, near, k, reach):
+def _as_found(index, queries, doubtful, near, k, reach, groups):
     return near.items
 
 
-def _with_few_again(index, queries, doubtful, near, k, reach):
+def _with_few_again(index, queries, doubtful, near, k, reach, groups):
     """The doubtful rows compared with every point: a walk costs more for so few."""
     q = queries.shape[0]
     rows = jnp.nonzero(doubtful, size=_FEW, fill_value=q)[0]
-    few = queries.at[rows].get(mode="fill", fill_value=0)
+    few, limits = (x.at[rows].get(mode="fill", fill_value=0) for x in (queries, reach))
     every = BruteForce(_FEW).build(index.points, index.mask)
-    items = every.search(few, rows < q, k, reach)
+    items = every.search(few, rows < q, k, limits, None)
     return near.items.at[rows].set(items, mode="drop")
 
 
-def _with_many_again(index, queries, doubtful, near, k, reach):
+def _with_many_again(index, queries, doubtful, near, k, reach, groups):
     """The doubtful rows searched in the tree."""
-    return search_in_tree(index.rest, queries, doubtful, near, k, reach).items
+    items = index.rest.search(queries, doubtful, k, reach, groups)
+    return jnp.where(doubtful[:, None], items, near.items)
 
 
 class CandidateLists(AbstractBackend):
     """List the `length` nearest points of every cell of a grid, `per_point` cells for
     every point.
 
-    Building takes more than a hundred times as long as that of a `CellList`; searches
+    Building takes more than a hundred times as long as that of a `KdTree`; searches
     of up to four neighbors near the points are about three times as fast afterwards.
     For a target that many scans are laid on. Any k is exact.
     """
@@ -122,22 +132,23 @@ class CandidateLists(AbstractBackend):
         points, mask = usable(points, mask)
         n = points.shape[0]
         m, cells = min(self.length, n), min(self.per_point * n, _MOST_CELLS)
-        rest = CellList(neighbors=m).build(points, mask)
-        low, width, counts = _grid(rest.low, rest.high, cells)
+        rest = KdTree().build(points, mask)
+        low, width, counts = _grid(*bounds(points, mask), cells)
         number = jnp.arange(cells, dtype=jnp.int32)
         centers = low + (_cell(number, counts) + 0.5) * width
         inside = number < jnp.prod(counts)
-        reach = jnp.asarray(jnp.inf, points.dtype)
-        search = lambda rows: rest.search(*rows, m, reach)
-        items = in_tiles(search, (centers, inside), _TILE)
+        anywhere = jnp.full(cells, jnp.inf, points.dtype)
+        search = lambda rows: rest.search(*rows[:2], m, rows[2], None)
+        items = in_tiles(search, (centers, inside, anywhere), _TILE)
         there = points.at[items].get(mode="fill", fill_value=jnp.inf)
         last = there[:, -1]
         last = jnp.sqrt(jnp.sum((last - centers) ** 2, axis=1))
         # A list with room to spare has all points.
         last = jnp.where(items[:, -1] < n, last, jnp.inf)
         table = jnp.concatenate([*(there[..., d] for d in range(3)), last[:, None]], 1)
-        near = CellList().build(points, mask)
-        return ListIndex(given, real, near, low, width, counts, table, items)
+        return ListIndex(
+            given, real, rest, rest.groups, low, width, counts, table, items
+        )
 
 
 def _grid(low, high, cells):
@@ -154,6 +165,17 @@ def _grid(low, high, cells):
 
 
 def _cell(number, counts) -> Int[Array, "c 3"]:
-    """The cell of a number, as `cell_id` counts them."""
+    """The cell of a number, as `_cell_id` counts them."""
     column, z = jnp.divmod(number, counts[2])
     return jnp.stack([*jnp.divmod(column, counts[1]), z], axis=1)
+
+
+def _cell_of(points, low, width, counts) -> Int[Array, "n 3"]:
+    """The cell of every point [n, 3]; outside of the grid the nearest one."""
+    scaled = jnp.floor((points - low) / width)
+    return jnp.clip(scaled, 0, (counts - 1).astype(points.dtype)).astype(jnp.int32)
+
+
+def _cell_id(cell, counts):
+    """The number of a cell, given by its three coordinates, first axis slowest."""
+    return (cell[0] * counts[1] + cell[1]) * counts[2] + cell[2]

@@ -1,7 +1,7 @@
 """Packets of queries that walk a tree of boxes together.
 
-Queries that follow one another on a Morton curve want nearly the same nodes. A packet
-of them reads every node once, and computes with it side by side; all packets of a tile
+Queries that lie together want nearly the same nodes. A packet of them reads every node
+once, and computes with it side by side; all packets of a tile
 step at the same time. What a packet has left for later is one bit per level (see
 `_tree`), and a packet that has finished gives its place to the next one. Rows of a
 table are read whole: a row is one copy, its entries alone would be gathers.
@@ -14,10 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from ._tree import Tree, next_node
+from ._tree import next_node
 
-# Queries of a packet, queries of a tile, steps down for every leaf, rounds to a refill.
-_WIDTH = 16
+# Queries of a tile, steps down for every leaf, rounds to a refill.
 _TILE = 4096
 _DESCENTS = 3
 _ROUNDS = 8
@@ -56,43 +55,30 @@ class _Lanes(eqx.Module):
     state: PyTree[Array]
 
 
-def child_boxes(tree: Tree) -> Float[Array, "h 12"]:
-    """The boxes of the two children of every inner node: low, high, low, high."""
-    pair = lambda x: x.reshape(3, -1, 2)
-    low, high = pair(tree.low), pair(tree.high)
-    sides = (low[:, :, 0], high[:, :, 0], low[:, :, 1], high[:, :, 1])
-    return jnp.concatenate(sides).T
-
-
 def walk(
     visit: AbstractVisit,
     queries: Float[Array, "q c"],
-    order: Int[Array, " q"],
+    groups: Int[Array, "g p"],
     start: PyTree[Array],
-    *,
-    width: int = _WIDTH,
 ):
     """The states [q] after every query has walked the tree of `visit`.
 
-    `order` lists the queries along a curve, `start` holds a state [q] for each; `width`
-    of them make a packet.
+    `groups` are the queries that lie together (q for none, last); `start` holds a state
+    [q] for each, which those keep that are in no group.
     """
-    q = queries.shape[0]
-    count = -(-q // width)
-    # The last packet is filled up with its last query.
-    place = jnp.minimum(jnp.arange(count * width), q - 1)
-    packed = lambda x: x[order[place]].reshape(count, width, *x.shape[1:])
+    # Places without a query double the first one of their packet.
+    rows = jnp.where(groups < queries.shape[0], groups, groups[:, :1])
+    count = jnp.sum(groups[:, 0] < queries.shape[0], dtype=jnp.int32)
+    packed = lambda x: x.at[rows].get(mode="clip")
     waiting = jnp.swapaxes(packed(queries), 1, 2)
-    fresh = jax.tree.map(packed, start)
-    final = _walk_all(visit, waiting, fresh)
-    back = jnp.zeros(q, jnp.int32).at[order].set(jnp.arange(q, dtype=jnp.int32))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[back], final)
+    final = _walk_all(visit, waiting, jax.tree.map(packed, start), count)
+    put = lambda x, new: x.at[groups].set(new, mode="drop")
+    return jax.tree.map(put, start, final)
 
 
-def _walk_all(visit, waiting, fresh):
-    """The states of all packets at the end, [packets, p]."""
-    count = waiting.shape[0]
-    tile = min(_TILE // waiting.shape[2], count)
+def _walk_all(visit, waiting, fresh, count):
+    """The states of the first `count` packets at the end, [packets, p]."""
+    tile = min(_TILE // waiting.shape[2], waiting.shape[0])
     pick = lambda x, rows: x.at[rows].get(mode="promise_in_bounds")
     idle = jnp.zeros(tile, jnp.int32)
     blank = jax.tree.map(lambda x: x[:tile], (waiting, fresh))
@@ -101,12 +87,12 @@ def _walk_all(visit, waiting, fresh):
     def refill(lane, out, used):
         """Finished packets hand in their state and make room for the next ones."""
         done = lane.node == 0
-        target = jnp.where(done, lane.packet, count)
+        target = jnp.where(done & (lane.packet < count), lane.packet, len(waiting))
         put = lambda to, x: to.at[target].set(x, mode="drop")
         out = jax.tree.map(put, out, lane.state)
         place = used + jnp.cumsum(done, dtype=jnp.int32) - done
         packet = jnp.where(done, jnp.minimum(place, count), lane.packet)
-        row = jnp.minimum(packet, count - 1)
+        row = jnp.minimum(packet, len(waiting) - 1)
         renew = lambda new, x: jnp.where(_as_rows(done, x), pick(new, row), x)
         node = jnp.where(done, (packet < count).astype(jnp.int32), lane.node)
         lane = _Lanes(

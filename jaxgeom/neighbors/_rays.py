@@ -8,12 +8,12 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core import RESULTS, check_shape, failure_where, safe_divide, safe_normalize
 from ..shapes import TriangleMesh
 from ._backends import usable
-from ._morton import curve
+from ._groups import kd_groups
 from ._packets import AbstractVisit, walk
 from ._surface import SurfaceIndex, index_surface
 
 # Rays part sooner than points: fewer to a packet.
-_WIDTH = 8
+_PACKET = 8
 # Channels of a ray: origin, direction, one over it, slack.
 _ORIGIN, _WAY, _OVER, _SLACK = slice(0, 3), slice(3, 6), slice(6, 9), 9
 
@@ -140,8 +140,8 @@ def _first_faces(index, rays, live):
     visit = RayVisit(index.visit.inner, rows)
     blank = jnp.full(q, leaves, jnp.int32)
     start = jnp.where(live, jnp.inf, -jnp.inf).astype(rays.dtype)
-    order = _together(queries, live)
-    state = walk(visit, queries, order, (start, start, blank, blank), width=_WIDTH)
+    groups = _together(index, queries, live)
+    state = walk(visit, queries, groups, (start, start, blank, blank))
     best, seen, leaf, last = state
     leaf = jnp.where(best < seen, last, leaf)
     slots = leaf[:, None] * tree.leaf + jnp.arange(tree.leaf)
@@ -169,12 +169,14 @@ def _channels(index, rays):
     return jnp.concatenate([origins, ways, 1 / safe, slack], axis=1)
 
 
-def _together(queries, live):
-    """Rays in an order in which neighbors run alike: by the octant, then the origin."""
-    near = curve(queries[:, _ORIGIN], live)
-    octant = (queries[:, _WAY] < 0) @ jnp.asarray([4, 2, 1])
-    octant = jnp.where(live, octant, 8)
-    return near[jnp.argsort(octant[near], stable=True)]
+def _together(index, queries, live):
+    """Groups of rays that run alike: near each other in six dimensions, origins in
+    units of the size of the mesh."""
+    corners = jnp.where(index.mask[:, None, None], index.corners, 0)
+    size = jnp.max(jnp.ptp(corners, axis=(0, 1)))
+    size = jnp.where(size > 0, size, 1)
+    places = jnp.concatenate([queries[:, _ORIGIN] / size, queries[:, _WAY]], axis=1)
+    return kd_groups(places, live, _PACKET)
 
 
 def _entry(low, high, ray):

@@ -9,11 +9,11 @@ from .._core import RESULTS, check_shape, failure_where, safe_divide, safe_norm
 from ..shapes import TriangleMesh
 from ._backends import usable
 from ._closest import ClosestVisit, face_rows
-from ._morton import curve
-from ._packets import child_boxes, walk
-from ._tree import Tree, grow
+from ._groups import kd_groups
+from ._packets import walk
+from ._tree import Tree, child_boxes, grow
 
-_LEAF = 4
+_LEAF, _PACKET = 4, 16
 
 
 class ClosestPoint(eqx.Module):
@@ -60,11 +60,11 @@ def closest_on_mesh(
 ) -> ClosestPoint:
     """The exact closest point of the mesh to every query [q, 3].
 
-    Packets of queries, sorted along a Morton curve, walk a tree of bounding boxes of
-    the faces; pass `index_surface(mesh)` to grow it only once. Which face is nearest is
-    a constant under differentiation; given the face, the gradient of the distance is
-    the unit vector from the closest point to the query, shared among the corners by
-    minus the barycentric coordinates (the envelope theorem), and zero on the surface.
+    Packets of queries that lie together walk a tree of bounding boxes of the faces;
+    pass `index_surface(mesh)` to grow it only once. Which face is nearest is a constant
+    under differentiation; given the face, the gradient of the distance is the unit
+    vector from the closest point to the query, shared among the corners by minus the
+    barycentric coordinates (the envelope theorem), and zero on the surface.
 
     Source: C. Ericson, Real-Time Collision Detection, 2005, 5.1.5 (closest point).
     """
@@ -94,10 +94,10 @@ def _plant(corners, mask):
     centers = jnp.mean(corners, axis=1)
     mask = mask & jnp.all(jnp.isfinite(centers), axis=-1)
     centers = jnp.where(mask[:, None], centers, 0)
-    tree = grow(curve(centers, mask), mask, low, high, _LEAF)
+    tree = grow(kd_groups(centers, mask, _LEAF), low, high)
     packed = corners.at[tree.order].get(mode="fill", fill_value=jnp.inf)
     packed = jnp.moveaxis(packed, 0, -1)
-    return tree, packed, ClosestVisit(child_boxes(tree), face_rows(packed, _LEAF))
+    return tree, packed, ClosestVisit(child_boxes(tree), face_rows(packed, tree.leaf))
 
 
 # Outside jit, loops would compile what they close over as constants (slowly).
@@ -107,7 +107,7 @@ def _nearest_faces(index, queries, live):
     tree, leaves = index.tree, index.visit.leaves.shape[0]
     f = index.corners.shape[0]
     start = ClosestVisit.start(live, leaves)
-    state = walk(index.visit, queries, curve(queries, live), start)
+    state = walk(index.visit, queries, kd_groups(queries, live, _PACKET), start)
     slots = ClosestVisit.leaf(state)[:, None] * tree.leaf + jnp.arange(tree.leaf)
     faces = tree.order.at[slots].get(mode="fill", fill_value=f)
     triangles = index.corners.at[faces].get(mode="fill", fill_value=jnp.inf)

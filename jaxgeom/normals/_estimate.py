@@ -20,8 +20,8 @@ def estimate(
     with `orient_toward_viewpoint` or `orient_consistently`. Where the neighbors are
     fewer than three, or coincide, or lie on a line, the normal is zero. Differentiable
     in the points; the neighbors are constants, and the gradient is zero where the
-    smallest eigenvalue is not simple. `backend` finds the neighbors (see
-    `neighbors.build`): `CellList(k)` by default.
+    smallest eigenvalue is not simple. `backend` finds the neighbors, see
+    `neighbors.build`.
 
     Source: Hoppe et al. 1992, Surface reconstruction from unorganized points, 3.1.
     """

@@ -67,7 +67,7 @@ def _outward(points, mask, capacity, steps):
     side = jnp.max(high - low)
     # The published widths are for the cube [-1, 1]^3 shrunk by 1.1.
     unit_points = (points - (low + high) / 2) / jnp.where(side > 0, side, 1) * (2 / 1.1)
-    order, _, _ = morton_order(points, mask, low, high)
+    order = morton_order(points, mask, low, high)
     total = jnp.sum(mask)
 
     def spread(size, count):

@@ -31,12 +31,13 @@ _BEYOND = 1.1
 class Memory(eqx.Module):
     """What a search for nearest points says about later ones.
 
-    Where each source point was when it was searched, which target point was the nearest
-    (one past the last if all are too far), and how far every other one was at least.
+    Where each source point was when it was searched, which target points were the
+    nearest two (one past the last if all are too far), and how far every point but the
+    first was at least.
     """
 
     points: Float[Array, "n 3"]
-    nearest: Int[Array, " n"]
+    nearest: Int[Array, "n 2"]
     apart: Float[Array, " n"]
 
 
@@ -51,6 +52,14 @@ class Found(eqx.Module):
     mask: Bool[Array, " n"]
     shares: Float[Array, "n 3"] | None = None
     memory: Memory | None = None
+
+    def blank(self) -> "Found":
+        """Nothing found yet, of the same shapes."""
+        none = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), self)
+        if none.memory is None:
+            return none
+        beyond = jnp.full_like(none.memory.nearest, jnp.iinfo(jnp.int32).max)
+        return eqx.tree_at(lambda f: f.memory.nearest, none, beyond)
 
 
 class Places(eqx.Module):
@@ -292,17 +301,23 @@ def _nearest(prepared, moved, max_distance, last) -> Found:
     memory = None if last is None else last.memory
     sure = _still_nearest(prepared, moved, memory, max_distance)
     index, points = prepared.index, jax.lax.stop_gradient(moved.points)
-    near = knn(index, points, 2, mask=moved.mask & ~sure, max_distance=reach)
-    apart = jnp.minimum(near.distances[:, 1], reach)
-    fresh = Memory(points, near.indices[:, 0], apart)
+    limit = (
+        reach if memory is None else jnp.minimum(reach, _beyond(index, points, memory))
+    )
+    # The scene has sorted its source so that neighbors follow one another.
+    rows = jnp.arange(points.shape[0], dtype=jnp.int32)[None]
+    unsure = moved.mask & ~sure
+    near = knn(index, points, 2, mask=unsure, max_distance=limit, groups=rows)
+    apart = jnp.minimum(near.distances[:, 1], limit)
+    fresh = Memory(points, near.indices, apart)
     if memory is not None:
         keep = lambda new, old: jnp.where(
             sure.reshape(-1, *[1] * (new.ndim - 1)), old, new
         )
         fresh = jax.tree.map(keep, fresh, memory)
-    distance = _distance_to(prepared, points, fresh.nearest)
-    mask = moved.mask & (distance <= max_distance)
-    return Found(jnp.where(mask, fresh.nearest, 0), mask, memory=fresh)
+    nearest = fresh.nearest[:, 0]
+    mask = moved.mask & (_distance_to(index, points, nearest) <= max_distance)
+    return Found(jnp.where(mask, nearest, 0), mask, memory=fresh)
 
 
 def _still_nearest(prepared, moved, memory, max_distance) -> Bool[Array, " n"]:
@@ -314,16 +329,23 @@ def _still_nearest(prepared, moved, memory, max_distance) -> Bool[Array, " n"]:
         return jnp.zeros(moved.mask.shape, bool)
     points = jax.lax.stop_gradient(moved.points)
     step = safe_norm(points - memory.points)
-    distance = _distance_to(prepared, points, memory.nearest)
+    distance = _distance_to(prepared.index, points, memory.nearest[:, 0])
     # Without a nearest point it is enough that the others stay beyond the gate.
     distance = jnp.minimum(distance, max_distance)
     rounding = 32 * jnp.finfo(points.dtype).eps * jnp.max(jnp.abs(points))
     return distance + rounding < memory.apart - step
 
 
-def _distance_to(prepared, points, nearest):
+def _beyond(index, points, memory):
+    """No farther than this are now two target points: those that were the nearest."""
+    far = lambda i: _distance_to(index, points, memory.nearest[:, i])
+    rounding = 1 + 8 * jnp.finfo(points.dtype).eps
+    return rounding * jnp.maximum(far(0), far(1))
+
+
+def _distance_to(index, points, nearest):
     """The distance to the nearest points; infinite where there is none."""
-    there = jax.lax.stop_gradient(prepared.index.points)
+    there = jax.lax.stop_gradient(index.points)
     there = there.at[nearest].get(mode="fill", fill_value=jnp.inf)
     some = jnp.isfinite(there[:, 0])
     gap = jnp.where(some[:, None], points - there, 0)

@@ -13,7 +13,7 @@ from .._core import (
     safe_norm,
     safe_normalize,
 )
-from ..neighbors import BruteForce, CellList, Neighbors, build, knn
+from ..neighbors import BruteForce, KdTree, Neighbors, build, knn
 from ..shapes import PointCloud
 
 _BINS = 11
@@ -68,9 +68,11 @@ def fpfh(
     washed = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, cloud.washed()))
     normals = safe_normalize(washed.normals)
     real = washed.mask & jnp.any(normals != 0, axis=1)
-    backend = BruteForce() if real.shape[0] <= _FEW else CellList(k + 1)
+    backend = BruteForce() if real.shape[0] <= _FEW else KdTree()
     index = build(washed.points, real, backend=backend)
-    near = knn(index, washed.points, k + 1, mask=real, max_distance=radius)
+    near = knn(
+        index, washed.points, k + 1, mask=real, max_distance=radius, groups=index.groups
+    )
     itself = near.indices == jnp.arange(real.shape[0])[:, None]
     near = eqx.tree_at(lambda x: x.mask, near, near.mask & ~itself)
     simple = _simple_histograms(washed.points, normals, near)

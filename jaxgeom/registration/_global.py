@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from .._core import RESULTS, GeometryError, failure_where, first_failure, message
 from ..clouds import thin
-from ..neighbors import CellList, build, knn
+from ..neighbors import build, knn
 from ..shapes import PointCloud
 from ..transforms import Rigid, procrustes
 from ._features import fpfh, match_features
@@ -151,7 +151,7 @@ def align_views(
 
 def _best_cover(source, target, guesses, threshold, polish):
     """The guess that, polished, brings most of the source onto the target."""
-    index = build(target.points, target.mask, backend=CellList(1))
+    index = build(target.points, target.mask)
     count = jnp.maximum(jnp.sum(source.mask), 1).astype(threshold.dtype)
 
     def judged(guess):

@@ -119,9 +119,7 @@ def _iterate(scene, pose, rtol, max_steps, history) -> _State:
         )
 
     record = jnp.full(max_steps, jnp.inf, dtype) if history else None
-    nothing = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(scene.match, pose)
-    )
+    nothing = jax.eval_shape(scene.match, pose).blank()
     start = _State(
         pose,
         pose,

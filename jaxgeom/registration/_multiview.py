@@ -33,7 +33,7 @@ from .._core import (
     safe_divide,
 )
 from ..clouds import thin
-from ..neighbors import AbstractBackend, CellList, build, knn
+from ..neighbors import AbstractBackend, build, knn
 from ..shapes import PointCloud
 from ..transforms import Rigid
 from ._kernels import AbstractKernel, Tukey
@@ -93,14 +93,13 @@ def multiview(
       than 45 degrees.
     - `max_steps`, `rtol`: of each level; steps that move no point by more than `rtol`
       voxels end it.
-    - `backend`: how matches are found, `CellList()` by default (see `neighbors.build`).
+    - `backend`: how matches are found (see `neighbors.build`).
 
     Poses are constants under differentiation; points moved by them are not. Raises
     `GeometryError` for clouds without normals or a start of another size.
     """
     _check(clouds, start)
     kernel = Tukey() if kernel is None else kernel
-    backend = CellList() if backend is None else backend
     clouds, start = jax.lax.stop_gradient(
         (jax.tree.map(jnp.asarray, clouds), jax.tree.map(jnp.asarray, start))
     )

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import GeometryError, check_shape, message
+from ..neighbors import kd_groups
 from ..shapes import PointCloud, TriangleMesh
 from ._correspondences import AbstractCorrespondence, Found, Nearest
 from ._kernels import AbstractKernel, Tukey
@@ -13,6 +14,9 @@ from ._models import AbstractModel, RigidModel, Tangent, tangent_of
 from ._objectives import AbstractObjective, PointToPlane
 from ._problem import Problem, problem_of
 from ._solvers import AbstractSolver, GaussNewton
+
+# Points of a group; successive groups are near each other too.
+_GROUP = 8
 
 
 class Method(eqx.Module):
@@ -107,6 +111,7 @@ def scene_of(source, target, method: Method, max_distance, weights) -> Scene:
         check_shape("weights", weights, source.mask.shape)
         given = jnp.where(source.mask, weights, 0).astype(dtype)
     source_center, _ = _center(source.points, source.mask)
+    source, given = _side_by_side(source, given)
     return Scene(
         _shifted(source, source_center),
         given,
@@ -128,6 +133,15 @@ def _washed(cloud) -> PointCloud:
         mask = mask & jnp.all(jnp.isfinite(normals), axis=1)
         normals = jnp.where(mask[:, None], normals, 0)
     return PointCloud(jnp.where(mask[:, None], points, 0), normals, mask)
+
+
+def _side_by_side(source, weights):
+    """The source sorted so that neighbors follow one another, wherever it moves: then
+    searches need not sort. What is masked makes way for blank rows at the end."""
+    rows = kd_groups(jax.lax.stop_gradient(source.points), source.mask, _GROUP)
+    rows = rows.reshape(-1)[: weights.shape[0]]
+    take = lambda x: x.at[rows].get(mode="fill", fill_value=0)
+    return jax.tree.map(take, (source, weights))
 
 
 def _extent(target):

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxgeom._core import RESULTS, GeometryError
-from jaxgeom.neighbors import BruteForce, CandidateLists, CellList, HostTree, build, knn
+from jaxgeom.neighbors import BruteForce, CandidateLists, HostTree, KdTree, build, knn
 
 N, Q = 1200, 300
 
@@ -58,7 +58,7 @@ def _assert_exact(points, queries, k, out):
 
 
 @pytest.mark.parametrize("name", CLOUDS)
-@pytest.mark.parametrize("backend", [CellList(4), BruteForce(tile=64), HostTree()])
+@pytest.mark.parametrize("backend", [KdTree(), BruteForce(tile=64), HostTree()])
 def test_equals_a_tree(name, backend):
     points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS[name])
     find = jax.jit(lambda p, q: knn(build(p, backend=backend), q, 5))
@@ -114,7 +114,7 @@ def test_other_counts_of_neighbors(k):
 
 
 @pytest.mark.parametrize(
-    "backend", [CellList(3), BruteForce(), CandidateLists(), HostTree()]
+    "backend", [KdTree(), BruteForce(), CandidateLists(), HostTree()]
 )
 def test_padding_and_missing_neighbors(backend):
     points, queries = CLOUDS["volume"]
@@ -130,7 +130,7 @@ def test_padding_and_missing_neighbors(backend):
 
 
 @pytest.mark.parametrize(
-    "backend", [CellList(6), BruteForce(), CandidateLists(), HostTree()]
+    "backend", [KdTree(), BruteForce(), CandidateLists(), HostTree()]
 )
 def test_max_distance_is_a_gate(backend):
     points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS["volume"])
@@ -145,7 +145,7 @@ def test_max_distance_is_a_gate(backend):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "backend", [CellList(), BruteForce(), CandidateLists(), HostTree(workers=1)]
+    "backend", [KdTree(), BruteForce(), CandidateLists(), HostTree(workers=1)]
 )
 def test_vmap_is_a_loop(backend):
     names = ["surface", "volume", "plane"]
