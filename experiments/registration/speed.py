@@ -3,13 +3,14 @@
     JAXGEOM_DATA=... python experiments/registration/speed.py [--cases 10k 40k many ...]
 
 A pair is bunny 045 on 000, started 10 degrees and 5 mm off, gate 5 mm: the raw scans
-(40k points each) or 10k points drawn from them. A batch is 64 ragged draws of about
-2 000 points of the raw scans, each turned by 10 degrees and moved by 5 mm from another
+(40k points each) or 10k points drawn from them. A batch is 64 ragged draws of about 2
+000 points of the raw scans, each turned by 10 degrees and moved by 5 mm from another
 draw of its own scan, aligned with it in one call. Every time holds search structures,
-normals of both sides and all iterations. Ours and the peers take turns; prints medians
-in ms of wall time and of CPU time of the process, errors in degrees and mm, the time to
-compile, and ratios. The gradient is that of a sum of the pose's numbers with respect to
-the points of both sides. Peers that are not installed are left out.
+normals of both sides and all iterations. Ours uses one CPU device for each core, which
+share the normals of a pair, or a batch; and one alone. Ours and the peers take turns;
+prints medians in ms of wall time and of CPU time of the process, errors in degrees and
+mm, the time to compile, and ratios. The gradient is that of a sum of the pose's numbers
+with respect to the points of both sides. Peers that are not installed are left out.
 """
 
 import argparse
@@ -22,6 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from scipy.spatial.transform import Rotation
 
 from jaxgeom import PointCloud, Rigid, stack
@@ -41,6 +43,8 @@ except ImportError:
 
 DATA = pathlib.Path(os.environ.get("JAXGEOM_DATA", ".")) / "registration"
 GATE, NEIGHBORS, MOST_STEPS, THREADS = 5.0, 12, 50, 2
+# As many as the peers have threads; a single pair uses the first one only.
+jax.config.update("jax_num_cpu_devices", THREADS)
 
 
 def scans():
@@ -139,16 +143,35 @@ class Ours(eqx.Module):
         return self.aligned(self.oriented(source), self.oriented(target), start, gate)
 
     @eqx.filter_jit
-    def align_all(self, clouds, starts, gate):
-        """All alignments of a batch, one after the other in one program.
+    def oriented_each(self, clouds, mesh):
+        """Clouds with normals, each device of the mesh one after the other."""
+        return on_each(lambda clouds: jax.lax.map(self.oriented, clouds), mesh)(clouds)
 
-        `clouds` holds the sources, and then the targets.
-        """
-        clouds = jax.lax.map(self.oriented, clouds)
-        half = starts.translation.shape[0]
-        side = lambda i: jax.tree.map(lambda x: x[i : i + half], clouds)
-        items = (side(0), side(half), starts)
-        return jax.lax.map(lambda item: self.aligned(*item, gate), items)
+    def align_on_two(self, both, start, gate, mesh):
+        """The same, with the normals of each side by a device of its own."""
+        first = jax.devices()[0]
+        both = jax.device_put(self.oriented_each(both, mesh), first)
+        source, target = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
+        return self.aligned(source, target, start, gate)
+
+    @eqx.filter_jit
+    def align_all(self, items, gate, mesh):
+        """All alignments of a batch of (source, target, start) in one program, each
+        device of the mesh one after the other."""
+        one = lambda item: self.align(*item, gate)
+        return on_each(lambda items: jax.lax.map(one, items), mesh)(items)
+
+
+def on_each(run, mesh):
+    """`run` on the share of each device."""
+    ways = dict(in_specs=PartitionSpec("item"), out_specs=PartitionSpec("item"))
+    return jax.shard_map(run, mesh=mesh, check_vma=False, **ways)
+
+
+def spread(items, devices):
+    """A batch with a share on each device, and the mesh of devices."""
+    mesh = Mesh(np.asarray(devices), ("item",))
+    return jax.device_put(items, NamedSharding(mesh, PartitionSpec("item"))), mesh
 
 
 OURS = {
@@ -241,6 +264,8 @@ def clock(runs, repeats):
     times = {name: [] for name in runs}
     for _ in range(repeats):
         for name, run in runs.items():
+            # Threads of another may still wait for work, and keep a core.
+            run()
             wall, work = time.perf_counter(), time.process_time()
             run()
             stop = time.perf_counter(), time.process_time()
@@ -278,7 +303,12 @@ def one_pair(label, size, repeats, door):
     print(f"{label}: {len(source)} on {len(target)}")
     arguments = (prepared(source), prepared(target), rigid(start), jnp.float32(GATE))
     call = lambda ours: jax.block_until_ready(ours.align(*arguments))
-    runs = {name: partial(call, ours) for name, ours in OURS.items()}
+    longest = max(len(source), len(target))
+    both, mesh = spread(stack(arguments[:2], capacity=longest), jax.devices()[:2])
+    on_two = lambda ours: ours.align_on_two(both, *arguments[2:], mesh)
+    runs = {"icp": lambda: jax.block_until_ready(on_two(OURS["icp"]))}
+    for name, ours in OURS.items():
+        runs[f"{name}, one device"] = partial(call, ours)
     center = source.mean(axis=0)
     told = lambda f: (
         note(table_of(f.target_from_source), truth, center)
@@ -327,9 +357,14 @@ def many(count, size, repeats):
     number = lambda x: jnp.asarray(x, jnp.float32 if x.dtype == float else x.dtype)
     clouds = jax.tree.map(number, clouds)
     starts = rigid(np.stack([item[2] for item in batch]))
-    arguments = (clouds, starts, jnp.float32(GATE))
-    call = lambda ours: jax.block_until_ready(ours.align_all(*arguments))
-    runs = {name: partial(call, ours) for name, ours in OURS.items()}
+    side = lambda i: jax.tree.map(lambda x: x[i : i + count], clouds)
+    items, runs = (side(0), side(count), starts), {}
+    for label, devices in (("", jax.devices()), (", one device", jax.devices()[:1])):
+        given, mesh = spread(items, devices)
+        call = lambda ours, given=given, mesh=mesh: jax.block_until_ready(
+            ours.align_all(given, jnp.float32(GATE), mesh)
+        )
+        runs |= {name + label: partial(call, ours) for name, ours in OURS.items()}
     told = lambda tables: "median {:.4f} deg {:.4f} mm, worst {:.3f} {:.3f}".format(
         *_spread(
             [

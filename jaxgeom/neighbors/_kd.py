@@ -30,18 +30,20 @@ class KdIndex(AbstractIndex):
             groups = kd_groups(queries, active, _PACKET)
         if k > FEW and groups.shape[1] <= _PACKET:
             # To compare costs most here: packets should be compact.
-            rows, count = groups, jnp.asarray(groups.shape[0], jnp.int32)
+            ways = [(groups, jnp.asarray(groups.shape[0], jnp.int32))]
         else:
-            rows, count = _in_packets(groups.reshape(-1), active)
+            ways = _in_packets(groups.reshape(-1), active)
         # The next number up, so that strictly nearer includes what lies at the limit;
         # not a subnormal one, which processors take for zero.
         limit = jnp.nextafter(reach, jnp.asarray(jnp.inf, reach.dtype))
         limit = jnp.maximum(limit, jnp.finfo(limit.dtype).tiny)
         limits = jnp.where(active & (reach >= 0), limit, -1)
-        found = search_nearest(self.boxes, packed(queries, rows, limits, count), k)
-        items = self.groups.reshape(-1).at[found.slots].get(mode="fill", fill_value=n)
-        out = jnp.full((q, k), n, jnp.int32)
-        return out.at[rows].set(jnp.moveaxis(items, 0, -1), mode="drop")
+        points, out = self.groups.reshape(-1), jnp.full((q, k), n, jnp.int32)
+        for rows, count in ways:
+            found = search_nearest(self.boxes, packed(queries, rows, limits, count), k)
+            items = points.at[found.slots].get(mode="fill", fill_value=n)
+            out = out.at[rows].set(jnp.moveaxis(items, 0, -1), mode="drop")
+        return out
 
 
 class KdTree(AbstractBackend):
@@ -57,18 +59,31 @@ class KdTree(AbstractBackend):
         return KdIndex(points, mask, groups, boxes)
 
 
-def _in_packets(order, active) -> tuple[Int[Array, "p g"], Int[Array, ""]]:
-    """The active rows in `order`, in packets, the rest q; and how many of these.
+def _in_packets(order, active) -> list[tuple[Int[Array, "p g"], Int[Array, ""]]]:
+    """The active rows in `order`, as packets of one if they are few, and as larger ones
+    if they are many (one of the two is empty): rows, q for none, and how many packets.
 
-    Packets are not filled where there are lanes for all of them: a few queries far from
-    each other have little in common.
+    Packets are not filled where there are lanes for more of them: queries far from each
+    other have little in common.
     """
     q = active.shape[0]
     wanted = active.at[order].get(mode="fill", fill_value=False)
     place, number = prefix_sum(wanted.astype(jnp.int32)), jnp.sum(wanted)
+    few = number <= LANES
+
+    def packets(use, group, shape):
+        """`group` of the rows in each packet of shape[1]."""
+        to = place // group * shape[1] + place % group
+        to = jnp.where(wanted & use, to, shape[0] * shape[1])
+        rows = (
+            jnp.full(shape[0] * shape[1], q, jnp.int32).at[to].set(order, mode="drop")
+        )
+        count = jnp.where(use, -(-number // group), 0).astype(jnp.int32)
+        return rows.reshape(shape), count
+
+    singles = packets(few, 1, (min(LANES, order.size), 1))
+    if order.size <= LANES:
+        return [singles]
     group = jnp.clip(-(-number // LANES), 1, _PACKET).astype(jnp.int32)
-    place = place // group * _PACKET + place % group
-    packets = max(-(-order.size // _PACKET), min(LANES, order.size))
-    place = jnp.where(wanted, place, packets * _PACKET)
-    rows = jnp.full(packets * _PACKET, q, jnp.int32).at[place].set(order, mode="drop")
-    return rows.reshape(packets, _PACKET), (-(-number // group)).astype(jnp.int32)
+    shape = (max(-(-order.size // _PACKET), LANES), _PACKET)
+    return [singles, packets(~few, group, shape)]

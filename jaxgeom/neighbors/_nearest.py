@@ -23,7 +23,7 @@ from ._tree import next_node
 # the tree for every leaf, leaves between two refills.
 LANES = 256
 _LANES_OF_MANY = 128
-_DESCENTS = 4
+_DESCENTS = 6
 _LEAVES = 4
 # Lists of so few neighbors are written out row by row.
 FEW = 4

@@ -7,7 +7,15 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxgeom._core import RESULTS, GeometryError
-from jaxgeom.neighbors import BruteForce, CandidateLists, HostTree, KdTree, build, knn
+from jaxgeom.neighbors import (
+    BruteForce,
+    CandidateLists,
+    HostTree,
+    KdTree,
+    build,
+    kd_groups,
+    knn,
+)
 
 N, Q = 1200, 300
 
@@ -155,6 +163,62 @@ def test_vmap_is_a_loop(backend):
     batch = jax.jit(jax.vmap(find))(points, queries)
     alone = jnp.stack([find(p, q) for p, q in zip(points, queries, strict=True)])
     np.testing.assert_allclose(batch, alone, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["surface", "clusters", "one place", "far apart"])
+def test_groups_lie_together(name):
+    """Every real row once, padding last, and compact."""
+    points = jnp.asarray(CLOUDS[name][0][:500], jnp.float32)
+    mask = jnp.arange(500) % 7 > 0
+    groups = np.asarray(jax.jit(kd_groups, static_argnums=2)(points, mask, 8))
+    count, size = groups.shape
+    assert size <= 8 and count & (count - 1) == 0
+    rows = groups.reshape(-1)
+    real = rows < 500
+    assert not np.any(~real[:-1] & real[1:])
+    np.testing.assert_array_equal(np.sort(rows[real]), np.flatnonzero(mask))
+    if name == "surface":
+        full = groups[np.all(groups < 500, axis=1)]
+        widths = np.ptp(np.asarray(points)[full], axis=1).max(axis=1)
+        # Square patches of a sphere of radius 2.3, as many as there are groups of 8.
+        side = np.sqrt(4 * np.pi * 2.3**2 / (mask.sum() / 8))
+        assert widths.mean() < 1.2 * side
+
+
+@pytest.mark.parametrize("k", [2, 5])
+def test_known_groups_and_few_queries_change_nothing(k):
+    """All queries, hundreds and a handful of them: packets of other sizes."""
+    points, _ = CLOUDS["surface"]
+    points = jnp.asarray(points, jnp.float32)
+    index = build(points)
+    find = jax.jit(lambda mask, groups: knn(index, points, k, mask=mask, groups=groups))
+    free = find(jnp.ones(N, bool), None)
+    _assert_exact(points, points, k, free)
+    number = np.random.default_rng(4).permutation(N)
+    for some in (N, 700, 300, 9, 0):
+        mask = jnp.asarray(number < some)
+        for groups in (None, index.groups):
+            found = find(mask, groups)
+            assert (found.mask == mask[:, None]).all()
+            np.testing.assert_array_equal(
+                found.indices, jnp.where(mask[:, None], free.indices, N)
+            )
+
+
+@pytest.mark.parametrize(
+    "backend", [KdTree(), BruteForce(), CandidateLists(), HostTree()]
+)
+def test_every_query_has_a_gate_of_its_own(backend):
+    points, queries = (jnp.asarray(x, jnp.float32) for x in CLOUDS["volume"])
+    index = build(points, backend=backend)
+    free = knn(index, queries, 2)
+    # Just beyond the first, the second, none, and all.
+    gate = jnp.stack([1.0001 * free.distances[:, 0], 1.0001 * free.distances[:, 1]])
+    gate = jnp.concatenate([gate, jnp.full((1, Q), -1.0), jnp.full((1, Q), jnp.inf)])
+    gate = gate[jnp.arange(Q) % 4, jnp.arange(Q)]
+    found = knn(index, queries, 2, max_distance=gate)
+    np.testing.assert_array_equal(found.mask, free.distances <= gate[:, None])
+    np.testing.assert_array_equal(found.indices, jnp.where(found.mask, free.indices, N))
 
 
 def test_gradients(x64):
