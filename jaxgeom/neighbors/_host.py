@@ -1,4 +1,4 @@
-"""Neighbors by scipy's k-d tree on the host: the fastest exact search on a CPU."""
+"""Neighbors by scipy's k-d tree on the host: for a CPU, and quick to compile."""
 
 from functools import lru_cache
 
