@@ -198,7 +198,7 @@ def _add_alignment(command):
     command.add_argument(
         "--objective",
         choices=("point-to-point", "point-to-plane", "symmetric", "generalized"),
-        default="symmetric",
+        default="point-to-plane",
     )
     command.add_argument(
         "--kernel",

@@ -17,7 +17,6 @@ from ..registration import (
     Method,
     PreparedTarget,
     Registration,
-    Symmetric,
     icp,
     prepare_target,
 )
@@ -35,27 +34,28 @@ class Pyramid(eqx.Module):
     Level i thins both clouds to one point per voxel of side `voxels[i]` times the voxel
     size (0: all points), and pairs points up to `gates[i]` voxel sizes apart. Levels
     that only start the next one end at steps below `coarse_rtol` (the `rtol` of `icp`).
-    Normals that are not given are estimated on each level from `neighbors` points.
+    Normals that are needed and not given are estimated on each level from `neighbors`
+    points.
     """
 
     voxels: tuple[float, ...] = eqx.field(static=True, default=(4.0, 2.0, 0.5))
     gates: tuple[float, ...] = eqx.field(static=True, default=(30.0, 10.0, 4.0))
     neighbors: int = eqx.field(static=True, default=12)
-    method: Method = Method(objective=Symmetric())
+    method: Method = Method()
     max_steps: int = eqx.field(static=True, default=50)
     coarse_rtol: float = eqx.field(static=True, default=1e-3)
 
 
-def make_level(cloud: PointCloud, side, room: int | None, neighbors: int):
-    """One point per voxel, with normals; and how many there are."""
-    if room is None:
-        oriented = cloud.normals is not None
-        return cloud if oriented else estimate(cloud, k=neighbors), jnp.zeros((), int)
-    if cloud.normals is not None:
-        return thin(cloud, side, room)
-    bare = PointCloud(cloud.points, jnp.zeros_like(cloud.points), cloud.mask)
-    small, need = thin(bare, side, room)
-    return estimate(PointCloud(small.points, None, small.mask), k=neighbors), need
+def _thinned(cloud: PointCloud, side, room: int | None):
+    """One point per voxel, and how many there are."""
+    return (cloud, jnp.zeros((), int)) if room is None else thin(cloud, side, room)
+
+
+def _oriented(cloud: PointCloud, name: str, pyramid: Pyramid) -> PointCloud:
+    """The cloud with normals, if they are needed of the one of this name."""
+    if cloud.normals is not None or name not in pyramid.method.normals_of:
+        return cloud
+    return estimate(cloud, k=pyramid.neighbors)
 
 
 def align(
@@ -74,11 +74,12 @@ def align(
 
     def level(i, side):
         # Both clouds in one loop: the program of a level is compiled once.
-        sizes = {"room": rooms[i], "neighbors": pyramid.neighbors}
-        make = partial(make_level, side=side, **sizes)
-        small, need = jax.lax.map(make, pair)
-        pick = lambda j: jax.tree.map(lambda x: x[j], small)
-        return pick(0), pick(1), _overflows(jnp.max(need), rooms[i])
+        small, need = jax.lax.map(partial(_thinned, side=side, room=rooms[i]), pair)
+        if "source" in pyramid.method.normals_of:
+            small = jax.lax.map(lambda c: _oriented(c, "source", pyramid), small)
+        source, target = (jax.tree.map(lambda x, j=j: x[j], small) for j in (0, 1))
+        target = _oriented(target, "target", pyramid)
+        return source, target, _overflows(jnp.max(need), rooms[i])
 
     return _descend(level, voxel_size, init, rooms, pyramid)
 
@@ -100,7 +101,8 @@ def target_levels(
     """The levels of a target, coarse first, each prepared by the rule of pairs."""
     out = []
     for room, share in zip(rooms, pyramid.voxels, strict=True):
-        small, need = make_level(target, share * voxel_size, room, pyramid.neighbors)
+        small, need = _thinned(target, share * voxel_size, room)
+        small = _oriented(small, "target", pyramid)
         out.append(TargetLevel(prepare_target(small, rule), _overflows(need, room)))
     return tuple(out)
 
@@ -116,9 +118,9 @@ def align_to(
     """As `align`, on the levels of a target that were made before."""
 
     def level(i, side):
-        small, need = make_level(source, side, rooms[i], pyramid.neighbors)
+        small, need = _thinned(source, side, rooms[i])
         full = levels[i].overflow | _overflows(need, rooms[i])
-        return small, levels[i].target, full
+        return _oriented(small, "source", pyramid), levels[i].target, full
 
     return _descend(level, voxel_size, init, rooms, pyramid)
 

@@ -37,7 +37,7 @@ def register(
     """The motion target_from_source that lays a scan on another (host form).
 
     Checks the clouds, centers them in double precision, chooses the voxel size, and
-    aligns coarse to fine by `icp`: by default symmetric residuals, a `Tukey` kernel
+    aligns coarse to fine by `icp`: by default points to planes, a `Tukey` kernel
     whose width follows the residuals, and a shrinking largest distance.
 
     **Arguments:**

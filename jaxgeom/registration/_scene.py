@@ -28,6 +28,12 @@ class Method(eqx.Module):
     model: AbstractModel = RigidModel()
     solver: AbstractSolver = GaussNewton()
 
+    @property
+    def normals_of(self) -> tuple[str, ...]:
+        """Whose normals are read, of "source" and "target"."""
+        checked = self.correspondence.check is not None
+        return ("source", "target") if checked else self.objective.normals_of
+
 
 class Scene(eqx.Module):
     """Source and target about their centers, and what does not change."""
