@@ -71,8 +71,8 @@ def knn(
     - `max_distance`: farther points are not neighbors (a point at it is); one number,
       or one for each query.
     - `groups`: all rows of the queries, in groups that lie together, where they are
-      known: `index.groups` for the points of the index, or those of `kd_groups`. It
-      saves the time to find them, and changes nothing else.
+      known: `index.groups` for the points of the index, or those of `kd_groups`. That
+      saves the time to find them; a row in no group finds nothing.
 
     Distances are differentiable in queries and points, with gradient zero where they
     are zero; the indices are constants. Raises `GeometryError` for wrong shapes or k.

@@ -20,7 +20,7 @@ from ._nearest import Nearest, inserted
 
 # The grid reaches beyond the points by this share of their extent.
 _MARGIN = 0.1
-# Picking a neighbor reads the whole list: for more of them the cells are faster.
+# Picking a neighbor reads the whole list: for more of them the tree is faster.
 _MANY = 4
 # Up to so many queries in doubt are compared with every point.
 _FEW = 32

@@ -1,11 +1,11 @@
 """The k nearest points of many queries, by packets that walk a tree of boxes.
 
-A packet is a group of queries near each other. Its box is compared with those of the
-nodes, nearer child first; at a leaf all its queries are compared with all the points.
-Many packets step at once, one per lane. What a lane has left for later is one bit per
-level: set where the sibling of its ancestor may still matter. A lane that has finished
-takes the next packet, so that none waits for the slowest. Nothing depends on the
-density of the points.
+A packet is a group of queries near each other. It goes where one of them may find
+something nearer, to the nearer child first; at a leaf all of them are compared with all
+the points. Many packets step at once, one per lane. What a lane has left for later is
+one bit per level: set where the sibling of its ancestor may still matter. A lane that
+has finished takes the next packet, so that none waits for the slowest. Nothing depends
+on the density of the points.
 
 Source: H. Afra, L. Szirmay-Kalos, Stackless multi-BVH traversal, 2014 (the bits);
 T. Aila, S. Laine, Understanding the efficiency of ray traversal on GPUs, 2009 (the
@@ -125,7 +125,8 @@ def search_nearest(boxes: Boxes, packets: Packets, k: int) -> Nearest:
 def _descend(boxes: Boxes, lane: _Lanes) -> _Lanes:
     """A few steps down, to the nearer child, or on to what was left for later."""
     inner_nodes = boxes.inner.shape[0]
-    # Boxes bound distances, and so do their rounded squares but for the last digits.
+    # A box bounds distances to its points, and so does its rounded square but for the
+    # last digits.
     worst = lane.best.squares[-1]
     reach = worst * (1 + 4 * jnp.finfo(worst.dtype).eps)
 

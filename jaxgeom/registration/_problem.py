@@ -152,9 +152,7 @@ def problem_of(
 ) -> Problem:
     """The problem of the pairs where `mask`."""
     wash = lambda x: jnp.where(mask, x.T, 0)
-    # What no residual reads need not be turned.
-    unused = moved.normals is None or "source" not in parts["objective"].normals_of
-    normals = jnp.zeros_like(moved.points) if unused else moved.normals
+    normals = jnp.zeros_like(moved.points) if moved.normals is None else moved.normals
     given = (moved.points, normals, places.points, places.normals)
     # Written down once: XLA would look the places up again wherever they are used.
     written = jax.lax.optimization_barrier(tuple(wash(x) for x in given))

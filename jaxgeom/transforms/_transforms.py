@@ -19,13 +19,6 @@ from ..shapes import PointCloud, TriangleMesh
 from ._rotations import left_jacobian, rotation_exp, rotation_log, skew_matrix
 
 
-def _times(matrix: Float[Array, "d d"], points: Float[Array, "*n d"]):
-    """M x for every point, column by column: so narrow a product of matrices takes ten
-    times as long on a CPU, and is rounded to fewer digits on some accelerators."""
-    columns = [points[..., j, None] * matrix[:, j] for j in range(len(matrix))]
-    return sum(columns[1:], columns[0])
-
-
 class AbstractTransform(eqx.Module):
     """A map x' = M x + t of space (d = 3), of the plane or of any dimension d."""
 
@@ -55,11 +48,11 @@ class AbstractTransform(eqx.Module):
 
     def points(self, points: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """M x + t for every point."""
-        return _times(self.linear(), points) + self.shift()
+        return points @ self.linear().T + self.shift()
 
     def normals(self, normals: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
         """The unit normals of the moved surface: M^-T n, normalised."""
-        return safe_normalize(_times(jnp.linalg.inv(self.linear()).T, normals))
+        return safe_normalize(normals @ jnp.linalg.inv(self.linear()))
 
     def matrix(self) -> Float[Array, "d+1 d+1"]:
         """The homogeneous matrix [[M, t], [0, 1]]."""
