@@ -3,8 +3,7 @@
 Every cell of a grid lists the points nearest to its center x, c_1 to c_m. A point that
 is not in the list is at least |x - c_m| from x, and so at least |x - c_m| - |q - x|
 from a query q of that cell (triangle inequality). Neighbors from the list that are
-nearer than this are certainly right; the other queries are compared with all points
-where they are few, and searched in a tree.
+nearer than this are certainly right; the other queries are searched in a tree.
 """
 
 import equinox as eqx
@@ -13,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ._backends import AbstractBackend, AbstractIndex, in_tiles, usable
-from ._brute import BruteForce
 from ._kd import KdIndex, KdTree
 from ._morton import bounds
 from ._nearest import Nearest, inserted
@@ -22,8 +20,6 @@ from ._nearest import Nearest, inserted
 _MARGIN = 0.1
 # Picking a neighbor reads the whole list: for more of them the tree is faster.
 _MANY = 4
-# Up to so many queries in doubt are compared with every point.
-_FEW = 32
 # A table of so many cells takes 68 MB with lists of 16.
 _MOST_CELLS = 2**18
 # Centers whose lists are made at a time.
@@ -47,12 +43,15 @@ class ListIndex(AbstractIndex):
     points: Float[Array, "n 3"]
     mask: Bool[Array, " n"]
     rest: KdIndex
-    groups: Int[Array, "g s"]
     low: Float[Array, " 3"]
     width: Float[Array, ""]
     counts: Int[Array, " 3"]
     table: Float[Array, "c w"]
     items: Int[Array, "c m"]
+
+    @property
+    def groups(self):
+        return self.rest.groups
 
     @eqx.filter_jit
     def search(self, queries, active, k, reach, groups):
@@ -60,11 +59,8 @@ class ListIndex(AbstractIndex):
             return self.rest.search(queries, active, k, reach, groups)
         near = self.from_lists(queries, k, reach)
         doubtful = active & ~near.certain
-        count = jnp.sum(doubtful)
-        ways = (_as_found, _with_few_again, _with_many_again)
-        way = jnp.where(count > min(_FEW, queries.shape[0]), 2, jnp.minimum(count, 1))
-        again = [lambda *args, f=f: f(self, *args, k, reach, groups) for f in ways]
-        return jax.lax.switch(way, again, queries, doubtful, near)
+        items = self.rest.search(queries, doubtful, k, reach, groups)
+        return jnp.where(doubtful[:, None], items, near.items)
 
     def from_lists(self, queries, k, reach) -> Near:
         """The k nearest of the candidates."""
@@ -92,26 +88,6 @@ class ListIndex(AbstractIndex):
         rounding = 32 * jnp.finfo(queries.dtype).eps * size
         certain = jnp.sqrt(limits) + away + rounding < entry[-1]
         return Near(found, certain)
-
-
-def _as_found(index, queries, doubtful, near, k, reach, groups):
-    return near.items
-
-
-def _with_few_again(index, queries, doubtful, near, k, reach, groups):
-    """The doubtful rows compared with every point: a walk costs more for so few."""
-    q = queries.shape[0]
-    rows = jnp.nonzero(doubtful, size=_FEW, fill_value=q)[0]
-    few, limits = (x.at[rows].get(mode="fill", fill_value=0) for x in (queries, reach))
-    every = BruteForce(_FEW).build(index.points, index.mask)
-    items = every.search(few, rows < q, k, limits, None)
-    return near.items.at[rows].set(items, mode="drop")
-
-
-def _with_many_again(index, queries, doubtful, near, k, reach, groups):
-    """The doubtful rows searched in the tree."""
-    items = index.rest.search(queries, doubtful, k, reach, groups)
-    return jnp.where(doubtful[:, None], items, near.items)
 
 
 class CandidateLists(AbstractBackend):
@@ -146,9 +122,7 @@ class CandidateLists(AbstractBackend):
         # A list with room to spare has all points.
         last = jnp.where(items[:, -1] < n, last, jnp.inf)
         table = jnp.concatenate([*(there[..., d] for d in range(3)), last[:, None]], 1)
-        return ListIndex(
-            given, real, rest, rest.groups, low, width, counts, table, items
-        )
+        return ListIndex(given, real, rest, low, width, counts, table, items)
 
 
 def _grid(low, high, cells):

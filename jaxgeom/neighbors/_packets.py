@@ -87,7 +87,7 @@ def _walk_all(visit, waiting, fresh, count):
     def refill(lane, out, used):
         """Finished packets hand in their state and make room for the next ones."""
         done = lane.node == 0
-        target = jnp.where(done & (lane.packet < count), lane.packet, len(waiting))
+        target = jnp.where(done, lane.packet, len(waiting))
         put = lambda to, x: to.at[target].set(x, mode="drop")
         out = jax.tree.map(put, out, lane.state)
         place = used + jnp.cumsum(done, dtype=jnp.int32) - done

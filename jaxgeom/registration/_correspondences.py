@@ -23,22 +23,7 @@ from ..neighbors import (
     knn,
 )
 from ..shapes import PointCloud, TriangleMesh
-
-# How far beyond the gate points are searched.
-_BEYOND = 1.1
-
-
-class Memory(eqx.Module):
-    """What a search for nearest points says about later ones.
-
-    Where each source point was when it was searched, which target points were the
-    nearest two (one past the last if all are too far), and how far every point but the
-    first was at least.
-    """
-
-    points: Float[Array, "n 3"]
-    nearest: Int[Array, "n 2"]
-    apart: Float[Array, " n"]
+from ._memory import Memory, nearest_pairs
 
 
 class Found(eqx.Module):
@@ -173,7 +158,10 @@ class AbstractNearest(AbstractCorrespondence):
         return _Indexed(target, index)
 
     def find(self, prepared, moved, max_distance, last):
-        found = _nearest(prepared, moved, max_distance, last)
+        memory = None if last is None else last.memory
+        memory, mask = nearest_pairs(prepared.index, moved, max_distance, memory)
+        indices = jnp.where(mask, memory.nearest[:, 0], 0)
+        found = Found(indices, mask, memory=memory)
         return _only(
             found, self.pairs(moved, self.places(prepared, moved, found), found)
         )
@@ -290,66 +278,6 @@ def _check_target(target, kind, name):
                 "callables.",
             )
         )
-
-
-def _nearest(prepared, moved, max_distance, last) -> Found:
-    """The nearest points; only those points are searched that the last search leaves
-    in doubt (after M. Greenspan, G. Godin, A nearest neighbor method for efficient ICP,
-    2001)."""
-    # Beyond the gate, so that points without a pair need not be searched at once.
-    reach = _BEYOND * max_distance
-    memory = None if last is None else last.memory
-    sure = _still_nearest(prepared, moved, memory, max_distance)
-    index, points = prepared.index, jax.lax.stop_gradient(moved.points)
-    limit = (
-        reach if memory is None else jnp.minimum(reach, _beyond(index, points, memory))
-    )
-    # The scene has sorted its source so that neighbors follow one another.
-    rows = jnp.arange(points.shape[0], dtype=jnp.int32)[None]
-    unsure = moved.mask & ~sure
-    near = knn(index, points, 2, mask=unsure, max_distance=limit, groups=rows)
-    apart = jnp.minimum(near.distances[:, 1], limit)
-    fresh = Memory(points, near.indices, apart)
-    if memory is not None:
-        keep = lambda new, old: jnp.where(
-            sure.reshape(-1, *[1] * (new.ndim - 1)), old, new
-        )
-        fresh = jax.tree.map(keep, fresh, memory)
-    nearest = fresh.nearest[:, 0]
-    mask = moved.mask & (_distance_to(index, points, nearest) <= max_distance)
-    return Found(jnp.where(mask, nearest, 0), mask, memory=fresh)
-
-
-def _still_nearest(prepared, moved, memory, max_distance) -> Bool[Array, " n"]:
-    """Where what was nearest at the last search must be so still.
-
-    A point that has moved by s is at least `apart` - s from every other target point.
-    """
-    if memory is None:
-        return jnp.zeros(moved.mask.shape, bool)
-    points = jax.lax.stop_gradient(moved.points)
-    step = safe_norm(points - memory.points)
-    distance = _distance_to(prepared.index, points, memory.nearest[:, 0])
-    # Without a nearest point it is enough that the others stay beyond the gate.
-    distance = jnp.minimum(distance, max_distance)
-    rounding = 32 * jnp.finfo(points.dtype).eps * jnp.max(jnp.abs(points))
-    return distance + rounding < memory.apart - step
-
-
-def _beyond(index, points, memory):
-    """No farther than this are now two target points: those that were the nearest."""
-    far = lambda i: _distance_to(index, points, memory.nearest[:, i])
-    rounding = 1 + 8 * jnp.finfo(points.dtype).eps
-    return rounding * jnp.maximum(far(0), far(1))
-
-
-def _distance_to(index, points, nearest):
-    """The distance to the nearest points; infinite where there is none."""
-    there = jax.lax.stop_gradient(index.points)
-    there = there.at[nearest].get(mode="fill", fill_value=jnp.inf)
-    some = jnp.isfinite(there[:, 0])
-    gap = jnp.where(some[:, None], points - there, 0)
-    return jnp.where(some, safe_norm(gap), jnp.inf)
 
 
 def _way_back(moved, places, found, backend) -> Int[Array, " n"]:
