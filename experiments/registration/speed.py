@@ -23,13 +23,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from scipy.spatial.transform import Rotation
 
 from jaxgeom import PointCloud, Rigid, stack
 from jaxgeom.neighbors import AbstractBackend, HostTree, KdTree
 from jaxgeom.normals import estimate
 from jaxgeom.pipelines import register
+from jaxgeom.pipelines._devices import on_each, placed
 from jaxgeom.registration import Method, Nearest, icp
 
 try:
@@ -125,16 +125,15 @@ class Ours(eqx.Module):
     that wait for each other.
     """
 
-    cells: AbstractBackend
-    pairs: AbstractBackend
+    neighbors: AbstractBackend
 
     @eqx.filter_jit
     def oriented(self, cloud):
-        return estimate(cloud, k=NEIGHBORS, backend=self.cells)
+        return estimate(cloud, k=NEIGHBORS, backend=self.neighbors)
 
     @eqx.filter_jit
     def aligned(self, source, target, start, gate):
-        method = Method(correspondence=Nearest(backend=self.pairs))
+        method = Method(correspondence=Nearest(backend=self.neighbors))
         given = dict(method=method, max_distance=gate, max_steps=MOST_STEPS)
         return icp(source, target, init=start, **given)
 
@@ -145,7 +144,8 @@ class Ours(eqx.Module):
     @eqx.filter_jit
     def oriented_each(self, clouds, mesh):
         """Clouds with normals, each device of the mesh one after the other."""
-        return on_each(lambda clouds: jax.lax.map(self.oriented, clouds), mesh)(clouds)
+        run = lambda clouds, _: jax.lax.map(self.oriented, clouds)
+        return on_each(run, mesh)(clouds, ())
 
     def align_on_two(self, both, start, gate, mesh):
         """The same, with the normals of each side by a device of its own."""
@@ -158,25 +158,13 @@ class Ours(eqx.Module):
     def align_all(self, items, gate, mesh):
         """All alignments of a batch of (source, target, start) in one program, each
         device of the mesh one after the other."""
-        one = lambda item: self.align(*item, gate)
-        return on_each(lambda items: jax.lax.map(one, items), mesh)(items)
-
-
-def on_each(run, mesh):
-    """`run` on the share of each device."""
-    ways = dict(in_specs=PartitionSpec("item"), out_specs=PartitionSpec("item"))
-    return jax.shard_map(run, mesh=mesh, check_vma=False, **ways)
-
-
-def spread(items, devices):
-    """A batch with a share on each device, and the mesh of devices."""
-    mesh = Mesh(np.asarray(devices), ("item",))
-    return jax.device_put(items, NamedSharding(mesh, PartitionSpec("item"))), mesh
+        run = lambda items, gate: jax.lax.map(lambda i: self.align(*i, gate), items)
+        return on_each(run, mesh)(items, gate)
 
 
 OURS = {
-    "icp": Ours(KdTree(), KdTree()),
-    "icp, host tree": Ours(HostTree(), HostTree()),
+    "icp": Ours(KdTree()),
+    "icp, host tree": Ours(HostTree()),
 }
 
 
@@ -304,7 +292,7 @@ def one_pair(label, size, repeats, door):
     arguments = (prepared(source), prepared(target), rigid(start), jnp.float32(GATE))
     call = lambda ours: jax.block_until_ready(ours.align(*arguments))
     longest = max(len(source), len(target))
-    both, mesh = spread(stack(arguments[:2], capacity=longest), jax.devices()[:2])
+    both, mesh = placed(stack(arguments[:2], capacity=longest))
     on_two = lambda ours: ours.align_on_two(both, *arguments[2:], mesh)
     runs = {"icp": lambda: jax.block_until_ready(on_two(OURS["icp"]))}
     for name, ours in OURS.items():
@@ -359,8 +347,7 @@ def many(count, size, repeats):
     starts = rigid(np.stack([item[2] for item in batch]))
     side = lambda i: jax.tree.map(lambda x: x[i : i + count], clouds)
     items, runs = (side(0), side(count), starts), {}
-    for label, devices in (("", jax.devices()), (", one device", jax.devices()[:1])):
-        given, mesh = spread(items, devices)
+    for label, (given, mesh) in (("", placed(items)), (", one device", (items, None))):
         call = lambda ours, given=given, mesh=mesh: jax.block_until_ready(
             ours.align_all(given, jnp.float32(GATE), mesh)
         )

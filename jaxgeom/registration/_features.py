@@ -13,12 +13,10 @@ from .._core import (
     safe_norm,
     safe_normalize,
 )
-from ..neighbors import BruteForce, KdTree, Neighbors, build, knn
+from ..neighbors import Neighbors, build, knn
 from ..shapes import PointCloud
 
 _BINS = 11
-# Below this many points comparing all is faster than lists of many neighbors.
-_FEW = 4096
 
 
 class Matches(eqx.Module):
@@ -68,8 +66,7 @@ def fpfh(
     washed = jax.lax.stop_gradient(jax.tree.map(jnp.asarray, cloud.washed()))
     normals = safe_normalize(washed.normals)
     real = washed.mask & jnp.any(normals != 0, axis=1)
-    backend = BruteForce() if real.shape[0] <= _FEW else KdTree()
-    index = build(washed.points, real, backend=backend)
+    index = build(washed.points, real)
     near = knn(
         index, washed.points, k + 1, mask=real, max_distance=radius, groups=index.groups
     )
