@@ -7,10 +7,10 @@ from jaxtyping import Array, Bool, Float, Int
 from .._core import prefix_sum
 from ._backends import AbstractBackend, AbstractIndex, usable
 from ._groups import kd_groups
-from ._nearest import FEW, LANES, Boxes, packed, search_nearest
+from ._nearest import FEW, Boxes, lanes_for, packed, search_nearest
 from ._tree import child_boxes, grow
 
-_LEAF, _PACKET = 8, 8
+_LEAF, _PACKET, _SMALL_PACKET = 8, 8, 4
 
 
 class KdIndex(AbstractIndex):
@@ -28,11 +28,11 @@ class KdIndex(AbstractIndex):
         n, q = self.points.shape[0], queries.shape[0]
         if groups is None:
             groups = kd_groups(queries, active, _PACKET)
-        if k > FEW and groups.shape[1] <= _PACKET:
-            # To compare costs most here: packets should be compact.
-            ways = [(groups, jnp.asarray(groups.shape[0], jnp.int32))]
+        order, lanes = groups.reshape(-1), lanes_for(self.boxes, k)
+        if k > FEW:
+            ways = [_in_small_packets(order, q)]
         else:
-            ways = _in_packets(groups.reshape(-1), active)
+            ways = _in_packets(order, active, lanes)
         # The next number up, so that strictly nearer includes what lies at the limit;
         # not a subnormal one, which processors take for zero.
         limit = jnp.nextafter(reach, jnp.asarray(jnp.inf, reach.dtype))
@@ -59,7 +59,9 @@ class KdTree(AbstractBackend):
         return KdIndex(points, mask, groups, boxes)
 
 
-def _in_packets(order, active) -> list[tuple[Int[Array, "p g"], Int[Array, ""]]]:
+def _in_packets(
+    order, active, lanes: int
+) -> list[tuple[Int[Array, "p g"], Int[Array, ""]]]:
     """The active rows in `order`, as packets of one if they are few, and as larger ones
     if they are many (one of the two is empty): rows, q for none, and how many packets.
 
@@ -69,7 +71,7 @@ def _in_packets(order, active) -> list[tuple[Int[Array, "p g"], Int[Array, ""]]]
     q = active.shape[0]
     wanted = active.at[order].get(mode="fill", fill_value=False)
     place, number = prefix_sum(wanted.astype(jnp.int32)), jnp.sum(wanted)
-    few = number <= LANES
+    few = number <= lanes
 
     def packets(use, group, shape):
         """`group` of the rows in each packet of shape[1]."""
@@ -81,9 +83,17 @@ def _in_packets(order, active) -> list[tuple[Int[Array, "p g"], Int[Array, ""]]]
         count = jnp.where(use, -(-number // group), 0).astype(jnp.int32)
         return rows.reshape(shape), count
 
-    singles = packets(few, 1, (min(LANES, order.size), 1))
-    if order.size <= LANES:
+    singles = packets(few, 1, (min(lanes, order.size), 1))
+    if order.size <= lanes:
         return [singles]
-    group = jnp.clip(-(-number // LANES), 1, _PACKET).astype(jnp.int32)
-    shape = (max(-(-order.size // _PACKET), LANES), _PACKET)
+    group = jnp.clip(-(-number // lanes), 1, _PACKET).astype(jnp.int32)
+    shape = (max(-(-order.size // _PACKET), lanes), _PACKET)
     return [singles, packets(~few, group, shape)]
+
+
+def _in_small_packets(order, q: int) -> tuple[Int[Array, "p g"], Int[Array, ""]]:
+    """All rows in `order`, a few in a packet: where lists are long, to compare costs
+    most, and compact packets meet fewer points."""
+    short = -order.size % _SMALL_PACKET
+    rows = jnp.pad(order, (0, short), constant_values=q).reshape(-1, _SMALL_PACKET)
+    return rows, jnp.asarray(rows.shape[0], jnp.int32)

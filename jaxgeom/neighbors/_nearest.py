@@ -19,10 +19,13 @@ from jaxtyping import Array, Float, Int
 
 from ._tree import next_node
 
-# Packets at a time (fewer with long lists, which should stay in the cache), steps down
-# the tree for every leaf, leaves between two refills.
-LANES = 256
-_LANES_OF_MANY = 128
+# Packets at a time: in a small tree, in a large one, with long lists. XLA on a CPU
+# divides the steps among threads where they touch much memory, the tree included: then
+# only wide ones are worth it, and otherwise narrow ones, which it leaves to one thread.
+_LANES, _LANES_OF_LARGE, _LANES_OF_MANY = 32, 1024, 128
+# Numbers in the leaves of a large tree.
+_LARGE = 2**17
+# Steps down the tree for every leaf, leaves between two refills.
 _DESCENTS = 6
 _LEAVES = 4
 # Lists of so few neighbors are written out row by row.
@@ -64,6 +67,13 @@ class _Lanes(eqx.Module):
     best: Nearest
 
 
+def lanes_for(boxes: Boxes, k: int) -> int:
+    """How many packets are searched at a time."""
+    if k > FEW:
+        return _LANES_OF_MANY
+    return _LANES_OF_LARGE if boxes.leaves.size > _LARGE else _LANES
+
+
 def packed(queries, rows: Int[Array, "p g"], limits, count) -> Packets:
     """The packets of `rows` of queries [q, 3]; a row of q is nobody."""
     points = queries.T.at[:, rows].get(mode="fill", fill_value=0)
@@ -83,7 +93,7 @@ def search_nearest(boxes: Boxes, packets: Packets, k: int) -> Nearest:
         jnp.zeros((k, number, group), packets.limits.dtype),
         jnp.full((k, number, group), slots, jnp.int32),
     )
-    lanes = min(LANES if k <= FEW else _LANES_OF_MANY, number)
+    lanes = min(lanes_for(boxes, k), number)
     idle = jnp.zeros(lanes, jnp.int32)
     blank = lambda *shape: jnp.zeros((*shape, lanes), packets.limits.dtype)
     best = Nearest(blank(k, group), jnp.zeros((k, group, lanes), jnp.int32))
