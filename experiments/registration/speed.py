@@ -23,6 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.random import key
 from scipy.spatial.transform import Rotation
 
 from jaxgeom import PointCloud, Rigid, stack
@@ -30,7 +31,8 @@ from jaxgeom.neighbors import AbstractBackend, HostTree, KdTree
 from jaxgeom.normals import estimate
 from jaxgeom.pipelines import register
 from jaxgeom.pipelines._devices import on_each, placed
-from jaxgeom.registration import Method, Nearest, icp
+from jaxgeom.registration import Method, Nearest, icp, prepare_target
+from jaxgeom.shapes import subsample
 
 try:
     import small_gicp
@@ -43,6 +45,8 @@ except ImportError:
 
 DATA = pathlib.Path(os.environ.get("JAXGEOM_DATA", ".")) / "registration"
 GATE, NEIGHBORS, MOST_STEPS, THREADS = 5.0, 12, 50, 2
+# When an alignment of a part is near enough: radians, and sizes of the target.
+COARSE = 1e-3
 # As many as the peers have threads; a single pair uses the first one only.
 jax.config.update("jax_num_cpu_devices", THREADS)
 
@@ -118,7 +122,8 @@ def prepared(points):
 
 
 class Ours(eqx.Module):
-    """Normals of both sides, then `icp`, with one way to find neighbors.
+    """Normals of both sides, then `icp`: first of a random part of the source, one
+    point of so many, and then of all.
 
     The normals of both sides are one program called twice: within one program XLA on
     the CPU may run two independent loops at once, and then wait forever for threads
@@ -126,33 +131,47 @@ class Ours(eqx.Module):
     """
 
     neighbors: AbstractBackend
+    part: int | None = eqx.field(static=True, default=None)
+
+    @property
+    def method(self):
+        return Method(correspondence=Nearest(backend=self.neighbors))
 
     @eqx.filter_jit
-    def oriented(self, cloud):
-        return estimate(cloud, k=NEIGHBORS, backend=self.neighbors)
+    def prepared(self, cloud):
+        """A cloud as a target, with normals by the same search structure."""
+        target = prepare_target(cloud, self.method.correspondence)
+        there = estimate(target.cloud, k=NEIGHBORS, index=target.index)
+        return target.with_normals(there.normals)
 
     @eqx.filter_jit
     def aligned(self, source, target, start, gate):
-        method = Method(correspondence=Nearest(backend=self.neighbors))
-        given = dict(method=method, max_distance=gate, max_steps=MOST_STEPS)
-        return icp(source, target, init=start, **given)
+        settings = dict(method=self.method, max_distance=gate, max_steps=MOST_STEPS)
+        if self.part is not None:
+            few = subsample(source, len(source.points) // self.part, key=key(0))
+            found = icp(few, target, init=start, rtol=COARSE, **settings)
+            start = found.target_from_source
+        return icp(source, target, init=start, **settings)
 
     def align(self, source, target, start, gate):
         """One alignment from bare points."""
-        return self.aligned(self.oriented(source), self.oriented(target), start, gate)
+        normals = self.prepared(source).cloud.normals
+        return self.aligned(
+            source.with_normals(normals), self.prepared(target), start, gate
+        )
 
     @eqx.filter_jit
-    def oriented_each(self, clouds, mesh):
-        """Clouds with normals, each device of the mesh one after the other."""
-        run = lambda clouds, _: jax.lax.map(self.oriented, clouds)
+    def prepared_each(self, clouds, mesh):
+        """Clouds as targets, each device of the mesh one after the other."""
+        run = lambda clouds, _: jax.lax.map(self.prepared, clouds)
         return on_each(run, mesh)(clouds, ())
 
-    def align_on_two(self, both, start, gate, mesh):
-        """The same, with the normals of each side by a device of its own."""
-        first = jax.devices()[0]
-        both = jax.device_put(self.oriented_each(both, mesh), first)
-        source, target = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
-        return self.aligned(source, target, start, gate)
+    def align_on_two(self, source, both, start, gate, mesh):
+        """The same, each side prepared by a device of its own."""
+        both = jax.device_put(self.prepared_each(both, mesh), jax.devices()[0])
+        here, there = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
+        source = source.with_normals(here.cloud.normals)
+        return self.aligned(source, there, start, gate)
 
     @eqx.filter_jit
     def align_all(self, items, gate, mesh):
@@ -163,6 +182,7 @@ class Ours(eqx.Module):
 
 
 OURS = {
+    "icp, a part first": Ours(KdTree(), 8),
     "icp": Ours(KdTree()),
     "icp, host tree": Ours(HostTree()),
 }
@@ -293,8 +313,10 @@ def one_pair(label, size, repeats, door):
     call = lambda ours: jax.block_until_ready(ours.align(*arguments))
     longest = max(len(source), len(target))
     both, mesh = placed(stack(arguments[:2], capacity=longest))
-    on_two = lambda ours: ours.align_on_two(both, *arguments[2:], mesh)
-    runs = {"icp": lambda: jax.block_until_ready(on_two(OURS["icp"]))}
+    two = lambda ours: ours.align_on_two(arguments[0], both, *arguments[2:], mesh)
+    runs = {}
+    for name in ("icp, a part first", "icp"):
+        runs[name] = lambda o=OURS[name]: jax.block_until_ready(two(o))
     for name, ours in OURS.items():
         runs[f"{name}, one device"] = partial(call, ours)
     center = source.mean(axis=0)
@@ -316,7 +338,8 @@ def one_pair(label, size, repeats, door):
 def gradient(label, size, repeats):
     """An alignment with its derivative beside the alignment alone."""
     source, target, start, _ = pair_case(size)
-    here, there = (OURS["icp"].oriented(prepared(x)) for x in (source, target))
+    oriented = lambda c: c.with_normals(OURS["icp"].prepared(c).cloud.normals)
+    here, there = (oriented(prepared(x)) for x in (source, target))
     arguments = (here, there, rigid(start), jnp.float32(GATE))
 
     def value(points, here, there, start, gate):

@@ -7,21 +7,26 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._core import safe_divide
-from ..neighbors import AbstractBackend, Neighbors, build, knn
+from ..neighbors import AbstractBackend, AbstractIndex, Neighbors, build, knn
 from ..shapes import PointCloud
 from ._frames import frames
 
 
 def nearest_graph(
-    cloud: PointCloud, k: int, *, backend: AbstractBackend | None = None
+    cloud: PointCloud,
+    k: int,
+    *,
+    backend: AbstractBackend | None = None,
+    index: AbstractIndex | None = None,
 ) -> Neighbors:
     """The k nearest points [n, k] of every point of a cloud, itself among them.
 
-    `backend` finds them, see `neighbors.build`. Status and masks are those of
-    `neighbors.knn`; padding finds nothing.
+    `backend` finds them, see `neighbors.build`; or `index`, where that of the points is
+    built already. Status and masks are those of `neighbors.knn`; padding finds nothing.
     """
     points = cloud.washed().points
-    index = build(points, cloud.mask, backend=backend)
+    if index is None:
+        index = build(points, cloud.mask, backend=backend)
     return knn(index, points, k, mask=cloud.mask, groups=index.groups)
 
 

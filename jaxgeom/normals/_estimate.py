@@ -6,12 +6,16 @@ from jaxtyping import Array, Float
 
 from .._core import safe_divide, safe_norm, safe_normalize
 from ..clouds import centered, frames, nearest_graph
-from ..neighbors import AbstractBackend, Neighbors
+from ..neighbors import AbstractBackend, AbstractIndex, Neighbors
 from ..shapes import PointCloud
 
 
 def estimate(
-    cloud: PointCloud, *, k: int = 16, backend: AbstractBackend | None = None
+    cloud: PointCloud,
+    *,
+    k: int = 16,
+    backend: AbstractBackend | None = None,
+    index: AbstractIndex | None = None,
 ) -> PointCloud:
     """The cloud with unit normals: the direction in which k neighbors spread least.
 
@@ -21,11 +25,12 @@ def estimate(
     fewer than three, or coincide, or lie on a line, the normal is zero. Differentiable
     in the points; the neighbors are constants, and the gradient is zero where the
     smallest eigenvalue is not simple. `backend` finds the neighbors, see
-    `neighbors.build`.
+    `neighbors.build`; or `index`, where that of the points is built already.
 
     Source: Hoppe et al. 1992, Surface reconstruction from unorganized points, 3.1.
     """
-    normals = local_normals(cloud, nearest_graph(cloud, k, backend=backend))
+    near = nearest_graph(cloud, k, backend=backend, index=index)
+    normals = local_normals(cloud, near)
     return cloud.with_normals(normals)
 
 

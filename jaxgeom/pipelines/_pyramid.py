@@ -51,11 +51,20 @@ def _thinned(cloud: PointCloud, side, room: int | None):
     return (cloud, jnp.zeros((), int)) if room is None else thin(cloud, side, room)
 
 
-def _oriented(cloud: PointCloud, name: str, pyramid: Pyramid) -> PointCloud:
-    """The cloud with normals, if they are needed of the one of this name."""
-    if cloud.normals is not None or name not in pyramid.method.normals_of:
+def _oriented(cloud: PointCloud, pyramid: Pyramid) -> PointCloud:
+    """A source with normals, if they are needed."""
+    if cloud.normals is not None or "source" not in pyramid.method.normals_of:
         return cloud
     return estimate(cloud, k=pyramid.neighbors)
+
+
+def _prepared(cloud: PointCloud, pyramid: Pyramid, rule: AbstractCorrespondence):
+    """The cloud as a target; its normals, if they are needed, by the same index."""
+    target = prepare_target(cloud, rule)
+    if cloud.normals is not None or "target" not in pyramid.method.normals_of:
+        return target
+    found = estimate(target.cloud, k=pyramid.neighbors, index=target.index)
+    return target.with_normals(found.normals)
 
 
 def align(
@@ -76,9 +85,9 @@ def align(
         # Both clouds in one loop: the program of a level is compiled once.
         small, need = jax.lax.map(partial(_thinned, side=side, room=rooms[i]), pair)
         if "source" in pyramid.method.normals_of:
-            small = jax.lax.map(lambda c: _oriented(c, "source", pyramid), small)
+            small = jax.lax.map(lambda c: _oriented(c, pyramid), small)
         source, target = (jax.tree.map(lambda x, j=j: x[j], small) for j in (0, 1))
-        target = _oriented(target, "target", pyramid)
+        target = _prepared(target, pyramid, pyramid.method.correspondence)
         return source, target, _overflows(jnp.max(need), rooms[i])
 
     return _descend(level, voxel_size, init, rooms, pyramid)
@@ -102,8 +111,8 @@ def target_levels(
     out = []
     for room, share in zip(rooms, pyramid.voxels, strict=True):
         small, need = _thinned(target, share * voxel_size, room)
-        small = _oriented(small, "target", pyramid)
-        out.append(TargetLevel(prepare_target(small, rule), _overflows(need, room)))
+        small = _prepared(small, pyramid, rule)
+        out.append(TargetLevel(small, _overflows(need, room)))
     return tuple(out)
 
 
@@ -120,7 +129,7 @@ def align_to(
     def level(i, side):
         small, need = _thinned(source, side, rooms[i])
         full = levels[i].overflow | _overflows(need, rooms[i])
-        return _oriented(small, "source", pyramid), levels[i].target, full
+        return _oriented(small, pyramid), levels[i].target, full
 
     return _descend(level, voxel_size, init, rooms, pyramid)
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._core import GeometryError, check_shape, message
-from ..neighbors import kd_groups
+from ..neighbors import AbstractIndex, kd_groups
 from ..shapes import PointCloud, TriangleMesh
 from ._correspondences import AbstractCorrespondence, Found, Nearest
 from ._kernels import AbstractKernel, Tukey
@@ -108,6 +108,21 @@ class PreparedTarget(eqx.Module):
     prepared: eqx.Module
     center: Float[Array, " 3"]
     size: Float[Array, ""]
+
+    @property
+    def cloud(self) -> PointCloud:
+        """The points of a cloud about their center."""
+        return self.prepared.target
+
+    @property
+    def index(self) -> AbstractIndex:
+        """The search structure of these points, for other uses."""
+        return self.prepared.index
+
+    def with_normals(self, normals: Float[Array, "n 3"]) -> "PreparedTarget":
+        """The same cloud, with other unit normals."""
+        cloud = self.cloud.with_normals(normals)
+        return eqx.tree_at(lambda t: t.prepared.target, self, cloud)
 
 
 def prepare_target(target, correspondence: AbstractCorrespondence) -> PreparedTarget:
