@@ -23,7 +23,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.random import key
 from scipy.spatial.transform import Rotation
 
 from jaxgeom import PointCloud, Rigid, stack
@@ -32,7 +31,6 @@ from jaxgeom.normals import estimate
 from jaxgeom.pipelines import register
 from jaxgeom.pipelines._devices import on_each, placed
 from jaxgeom.registration import Method, Nearest, icp, prepare_target
-from jaxgeom.shapes import subsample
 
 try:
     import small_gicp
@@ -45,8 +43,9 @@ except ImportError:
 
 DATA = pathlib.Path(os.environ.get("JAXGEOM_DATA", ".")) / "registration"
 GATE, NEIGHBORS, MOST_STEPS, THREADS = 5.0, 12, 50, 2
-# When an alignment of a part is near enough: radians, and sizes of the target.
-COARSE = 1e-3
+# How many points are aligned first, and when they are near enough: radians, and sizes
+# of the target.
+FIRST, COARSE = 400, 1e-3
 # As many as the peers have threads; a single pair uses the first one only.
 jax.config.update("jax_num_cpu_devices", THREADS)
 
@@ -122,8 +121,8 @@ def prepared(points):
 
 
 class Ours(eqx.Module):
-    """Normals of both sides, then `icp`: first of a random part of the source, one
-    point of so many, and then of all.
+    """Normals of both sides, then `icp`: first of about so many points of the source,
+    if any, and then of all.
 
     The normals of both sides are one program called twice: within one program XLA on
     the CPU may run two independent loops at once, and then wait forever for threads
@@ -131,7 +130,7 @@ class Ours(eqx.Module):
     """
 
     neighbors: AbstractBackend
-    part: int | None = eqx.field(static=True, default=None)
+    first: int | None = eqx.field(static=True, default=None)
 
     @property
     def method(self):
@@ -147,8 +146,9 @@ class Ours(eqx.Module):
     @eqx.filter_jit
     def aligned(self, source, target, start, gate):
         settings = dict(method=self.method, max_distance=gate, max_steps=MOST_STEPS)
-        if self.part is not None:
-            few = subsample(source, len(source.points) // self.part, key=key(0))
+        if self.first is not None:
+            skip = max(len(source.points) // self.first, 1)
+            few = jax.tree.map(lambda x: x[::skip], source)
             found = icp(few, target, init=start, rtol=COARSE, **settings)
             start = found.target_from_source
         return icp(source, target, init=start, **settings)
@@ -169,6 +169,11 @@ class Ours(eqx.Module):
     def align_on_two(self, source, both, start, gate, mesh):
         """The same, each side prepared by a device of its own."""
         both = jax.device_put(self.prepared_each(both, mesh), jax.devices()[0])
+        return self.aligned_of(source, both, start, gate)
+
+    @eqx.filter_jit
+    def aligned_of(self, source, both, start, gate):
+        """The alignment of a source, given both sides as targets."""
         here, there = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
         source = source.with_normals(here.cloud.normals)
         return self.aligned(source, there, start, gate)
@@ -182,7 +187,7 @@ class Ours(eqx.Module):
 
 
 OURS = {
-    "icp, a part first": Ours(KdTree(), 8),
+    "icp, few first": Ours(KdTree(), FIRST),
     "icp": Ours(KdTree()),
     "icp, host tree": Ours(HostTree()),
 }
@@ -311,12 +316,14 @@ def one_pair(label, size, repeats, door):
     print(f"{label}: {len(source)} on {len(target)}")
     arguments = (prepared(source), prepared(target), rigid(start), jnp.float32(GATE))
     call = lambda ours: jax.block_until_ready(ours.align(*arguments))
+    both_sides = lambda ours: jax.block_until_ready(ours.align_on_two(*given))
     longest = max(len(source), len(target))
-    both, mesh = placed(stack(arguments[:2], capacity=longest))
-    two = lambda ours: ours.align_on_two(arguments[0], both, *arguments[2:], mesh)
+    padded = stack(arguments[:2], capacity=longest)
+    both, mesh = placed(padded)
+    given = (jax.tree.map(lambda x: x[0], padded), both, *arguments[2:], mesh)
     runs = {}
-    for name in ("icp, a part first", "icp"):
-        runs[name] = lambda o=OURS[name]: jax.block_until_ready(two(o))
+    for name in ("icp, few first", "icp"):
+        runs[name] = partial(both_sides, OURS[name])
     for name, ours in OURS.items():
         runs[f"{name}, one device"] = partial(call, ours)
     center = source.mean(axis=0)

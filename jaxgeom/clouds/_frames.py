@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-# Convergence is quadratic: four sweeps reach single precision, six double.
-_SWEEPS = 6
+# Convergence is quadratic: so many sweeps reach single and double precision.
+_SWEEPS = {32: 4, 64: 6}
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
@@ -20,7 +20,8 @@ def frames(
     entries = [[matrix[..., i, j] for j in range(3)] for i in range(3)]
     one, zero = jnp.ones_like(entries[0][0]), jnp.zeros_like(entries[0][0])
     vectors = [[one if i == j else zero for i in range(3)] for j in range(3)]
-    entries, vectors = jax.lax.fori_loop(0, _SWEEPS, _sweep, (entries, vectors))
+    sweeps = _SWEEPS[jnp.finfo(one.dtype).bits]
+    entries, vectors = jax.lax.fori_loop(0, sweeps, _sweep, (entries, vectors))
     values = [entries[i][i] for i in range(3)]
     for p, q in ((0, 1), (1, 2), (0, 1)):
         swap = values[q] < values[p]

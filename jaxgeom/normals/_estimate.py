@@ -51,12 +51,18 @@ def plane_residual(cloud: PointCloud, *, k: int = 16) -> Float[Array, " n"]:
 
 def local_normals(cloud: PointCloud, near: Neighbors) -> Float[Array, "n 3"]:
     """The unit normals [n, 3] of the planes through given neighborhoods."""
-    gaps, _ = centered(cloud, near)
+    # Axis by axis and neighbors first, which a CPU reads faster.
+    there = near.mask.T
+    rows, count = jnp.where(there, near.indices.T, 0), jnp.sum(there, axis=0)
+    only = lambda x: jnp.where(there, x, 0)
+    mean = lambda x: jnp.sum(x, axis=0) / jnp.maximum(count, 1).astype(x.dtype)
+    gaps = [only(x[rows] - x) for x in jnp.asarray(cloud.washed().points).T]
+    gaps = jnp.stack([only(gap - mean(gap)) for gap in gaps])
     # Neighborhoods of any size become of order 1, so that squares keep their digits.
-    size = jax.lax.stop_gradient(jnp.max(jnp.abs(gaps), axis=(1, 2), keepdims=True))
-    scaled = gaps / jnp.where(size > 0, size, 1)
-    spread = jnp.einsum("nki,nkj->nij", scaled, scaled)
-    return smallest_direction(spread)
+    size = jax.lax.stop_gradient(jnp.max(jnp.abs(gaps), axis=(0, 1)))
+    gaps = gaps / jnp.where(size > 0, size, 1)
+    spread = jnp.stack([jnp.stack([jnp.sum(a * b, 0) for b in gaps]) for a in gaps])
+    return smallest_direction(jnp.moveaxis(spread, -1, 0))
 
 
 @jax.custom_jvp
