@@ -22,9 +22,9 @@ from ._tree import next_node
 # Packets at a time: in a small tree, in a large one, with long lists. XLA on a CPU
 # divides the steps among threads where they touch much memory, the tree included: then
 # only wide ones are worth it, and otherwise narrow ones, which it leaves to one thread.
-_LANES, _LANES_OF_LARGE, _LANES_OF_MANY = 32, 1024, 128
+_LANES, _LANES_OF_LARGE, _LANES_OF_MANY = 32, 512, 128
 # Numbers in the leaves of a large tree.
-_LARGE = 2**17
+_LARGE = 2**16
 # Steps down the tree for every leaf, leaves between two refills.
 _DESCENTS = 6
 _LEAVES = 4
