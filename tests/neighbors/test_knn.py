@@ -112,6 +112,14 @@ def test_lists_decide_most_queries_near_the_points():
     assert not index.from_lists(far, 2, jnp.float32(jnp.inf)).certain.any()
 
 
+def test_large_clouds_are_searched_in_wide_steps():
+    rng = np.random.default_rng(8)
+    points, queries = (rng.normal(size=(n, 3)) for n in (24_000, Q))
+    points, queries = (jnp.asarray(x, jnp.float32) for x in (points, queries))
+    find = jax.jit(lambda p, q: knn(build(p), q, 2))
+    _assert_exact(points, queries, 2, find(points, queries))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("k", [1, pytest.param(64, marks=pytest.mark.slow)])
 def test_other_counts_of_neighbors(k):

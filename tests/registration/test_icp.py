@@ -13,6 +13,7 @@ from jaxgeom import Affine, PointCloud, Rigid, Similarity, TriangleMesh
 from jaxgeom._core import RESULTS, GeometryError
 from jaxgeom.meshes import icosphere
 from jaxgeom.neighbors import BruteForce, HostTree
+from jaxgeom.normals import estimate
 from jaxgeom.registration import (
     L2,
     AffineModel,
@@ -40,6 +41,7 @@ from jaxgeom.registration import (
     Trimmed,
     Tukey,
     icp,
+    prepare_target,
     translation_only,
     yaw,
 )
@@ -101,6 +103,25 @@ def align(source, target, **settings):
 def _off(found, move=MOVE):
     truth = Rigid.exp(jnp.asarray(move)).matrix()
     return np.abs(np.asarray(found.target_from_source.matrix()) - truth).max()
+
+
+def test_a_target_gets_its_normals_by_its_own_index():
+    source, target = _pair()
+    bare = PointCloud(target.points)
+    prepared = prepare_target(bare, Nearest(backend=BruteForce()))
+    found = estimate(prepared.cloud, k=12, index=prepared.index).normals
+    want = estimate(bare, k=12, backend=BruteForce()).normals
+    cosine = np.abs(np.sum(np.asarray(found) * np.asarray(want), axis=1))
+    assert cosine.min() > 1 - 1e-5
+    first = align(source, prepared.with_normals(found))
+    second = align(source, bare.with_normals(want))
+    assert first.result == second.result == RESULTS.successful
+    assert _off(first) < 0.01
+    np.testing.assert_allclose(
+        first.target_from_source.matrix(),
+        second.target_from_source.matrix(),
+        atol=2e-5,
+    )
 
 
 SOLVERS = [
