@@ -7,7 +7,8 @@ A pair is bunny 045 on 000, started 10 degrees and 5 mm off, gate 5 mm: the raw 
 000 points of the raw scans, each turned by 10 degrees and moved by 5 mm from another
 draw of its own scan, aligned with it in one call. Every time holds search structures,
 normals of both sides and all iterations. Ours uses one CPU device for each core, which
-share the normals of a pair, or a batch; and one alone. Ours and the peers take turns;
+share the normals of a pair, or a batch; and one alone; and aligns all points at once,
+or first a few. Ours and the peers take turns;
 prints medians in ms of wall time and of CPU time of the process, errors in degrees and
 mm, the time to compile, and ratios. The gradient is that of a sum of the pose's numbers
 with respect to the points of both sides. Peers that are not installed are left out.
@@ -316,11 +317,11 @@ def one_pair(label, size, repeats, door):
     print(f"{label}: {len(source)} on {len(target)}")
     arguments = (prepared(source), prepared(target), rigid(start), jnp.float32(GATE))
     call = lambda ours: jax.block_until_ready(ours.align(*arguments))
-    both_sides = lambda ours: jax.block_until_ready(ours.align_on_two(*given))
     longest = max(len(source), len(target))
     padded = stack(arguments[:2], capacity=longest)
     both, mesh = placed(padded)
     given = (jax.tree.map(lambda x: x[0], padded), both, *arguments[2:], mesh)
+    both_sides = lambda ours: jax.block_until_ready(ours.align_on_two(*given))
     runs = {}
     for name in ("icp, few first", "icp"):
         runs[name] = partial(both_sides, OURS[name])

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._core import safe_divide
+from .._core import GeometryError, message, safe_divide
 from ..neighbors import AbstractBackend, AbstractIndex, Neighbors, build, knn
 from ..shapes import PointCloud
 from ._frames import frames
@@ -27,6 +27,15 @@ def nearest_graph(
     points = cloud.washed().points
     if index is None:
         index = build(points, cloud.mask, backend=backend)
+    elif backend is not None or index.points.shape != points.shape:
+        raise GeometryError(
+            message(
+                "an index must be that of the points, and goes without a backend",
+                f"backend {backend}, an index of {index.points.shape[0]} points for "
+                f"{points.shape[0]}",
+                "Pass the index that was built of this cloud, or a backend.",
+            )
+        )
     return knn(index, points, k, mask=cloud.mask, groups=index.groups)
 
 

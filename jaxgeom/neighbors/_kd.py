@@ -28,11 +28,11 @@ class KdIndex(AbstractIndex):
         n, q = self.points.shape[0], queries.shape[0]
         if groups is None:
             groups = kd_groups(queries, active, _PACKET)
-        order, lanes = groups.reshape(-1), lanes_for(self.boxes, k)
+        order = groups.reshape(-1)
         if k > FEW:
             ways = [_in_small_packets(order, q)]
         else:
-            ways = _in_packets(order, active, lanes)
+            ways = _in_packets(order, active, lanes_for(self.boxes, k))
         # The next number up, so that strictly nearer includes what lies at the limit;
         # not a subnormal one, which processors take for zero.
         limit = jnp.nextafter(reach, jnp.asarray(jnp.inf, reach.dtype))

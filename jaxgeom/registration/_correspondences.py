@@ -124,7 +124,7 @@ class AbstractCorrespondence(eqx.Module):
         return _only(found, self.check(moved.normals, places.normals))
 
 
-class _Indexed(eqx.Module):
+class Indexed(eqx.Module):
     """The target cloud and its search structure."""
 
     target: PointCloud
@@ -155,7 +155,7 @@ class AbstractNearest(AbstractCorrespondence):
         _check_target(target, PointCloud, "this correspondence")
         target = jax.tree.map(jnp.asarray, target)
         index = build(target.points, target.mask, backend=self.backend)
-        return _Indexed(target, index)
+        return Indexed(target, index)
 
     def find(self, prepared, moved, max_distance, last):
         memory = None if last is None else last.memory

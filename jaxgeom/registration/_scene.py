@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from .._core import GeometryError, check_shape, message
 from ..neighbors import AbstractIndex, kd_groups
 from ..shapes import PointCloud, TriangleMesh
-from ._correspondences import AbstractCorrespondence, Found, Nearest
+from ._correspondences import AbstractCorrespondence, Found, Indexed, Nearest
 from ._kernels import AbstractKernel, Tukey
 from ._models import AbstractModel, RigidModel, Tangent, tangent_of
 from ._objectives import AbstractObjective, PointToPlane
@@ -112,17 +112,28 @@ class PreparedTarget(eqx.Module):
     @property
     def cloud(self) -> PointCloud:
         """The points of a cloud about their center."""
-        return self.prepared.target
+        return self._indexed().target
 
     @property
     def index(self) -> AbstractIndex:
         """The search structure of these points, for other uses."""
-        return self.prepared.index
+        return self._indexed().index
 
     def with_normals(self, normals: Float[Array, "n 3"]) -> "PreparedTarget":
         """The same cloud, with other unit normals."""
         cloud = self.cloud.with_normals(normals)
         return eqx.tree_at(lambda t: t.prepared.target, self, cloud)
+
+    def _indexed(self):
+        if isinstance(self.prepared, Indexed):
+            return self.prepared
+        raise GeometryError(
+            message(
+                "only a cloud as target has points and an index",
+                type(self.prepared).__name__,
+                "Prepare a PointCloud with Nearest, Mutual or Reciprocal.",
+            )
+        )
 
 
 def prepare_target(target, correspondence: AbstractCorrespondence) -> PreparedTarget:

@@ -122,6 +122,10 @@ def test_a_target_gets_its_normals_by_its_own_index():
         second.target_from_source.matrix(),
         atol=2e-5,
     )
+    with pytest.raises(GeometryError, match="an index must be that of the points"):
+        estimate(source, k=12, index=prepared.index)
+    with pytest.raises(GeometryError, match="only a cloud as target"):
+        _ = prepare_target(icosphere(1), ClosestSurface()).index
 
 
 SOLVERS = [
