@@ -24,6 +24,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 from scipy.spatial.transform import Rotation
 
 from jaxgeom import PointCloud, Rigid, stack
@@ -162,22 +164,27 @@ class Ours(eqx.Module):
         )
 
     @eqx.filter_jit
-    def prepared_each(self, clouds, mesh):
-        """Clouds as targets, each device of the mesh one after the other."""
-        run = lambda clouds, _: jax.lax.map(self.prepared, clouds)
-        return on_each(run, mesh)(clouds, ())
+    def align_on_two(self, source, target, start, gate, mesh):
+        """The same by two devices that share the normals of the target; then one
+        aligns, and the other finds the normals of the source: what each has found."""
+        (axis,) = mesh.axis_names
 
-    def align_on_two(self, source, both, start, gate, mesh):
-        """The same, each side prepared by a device of its own."""
-        both = jax.device_put(self.prepared_each(both, mesh), jax.devices()[0])
-        return self.aligned_of(source, both, start, gate)
+        def run(source, target, start, gate):
+            there = prepare_target(target, self.method.correspondence)
+            shared = dict(index=there.index, axis=axis)
+            normals = estimate(there.cloud, k=NEIGHBORS, **shared).normals
+            tasks = (
+                lambda: self.aligned(source, there.with_normals(normals), start, gate),
+                lambda: estimate(source, k=NEIGHBORS).normals,
+            )
+            out = taken_by_one(tasks, jax.lax.axis_index(axis))
+            return jax.tree.map(lambda x: x[None], out)
 
-    @eqx.filter_jit
-    def aligned_of(self, source, both, start, gate):
-        """The alignment of a source, given both sides as targets."""
-        here, there = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
-        source = source.with_normals(here.cloud.normals)
-        return self.aligned(source, there, start, gate)
+        each = jax.shard_map(
+            run, mesh=mesh, in_specs=P(), out_specs=P(axis), check_vma=False
+        )
+        found, normals = each(source, target, start, gate)
+        return jax.tree.map(lambda x: x[0], found), normals[1]
 
     @eqx.filter_jit
     def align_all(self, items, gate, mesh):
@@ -185,6 +192,17 @@ class Ours(eqx.Module):
         device of the mesh one after the other."""
         run = lambda items, gate: jax.lax.map(lambda i: self.align(*i, gate), items)
         return on_each(run, mesh)(items, gate)
+
+
+def taken_by_one(tasks, number):
+    """What each task gives, where it is that of this number; otherwise zeros."""
+    shapes = [jax.eval_shape(task) for task in tasks]
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def only(i):
+        return lambda: [tasks[i]() if i == j else b for j, b in enumerate(blank)]
+
+    return jax.lax.switch(number, [only(i) for i in range(len(tasks))])
 
 
 OURS = {
@@ -317,14 +335,12 @@ def one_pair(label, size, repeats, door):
     print(f"{label}: {len(source)} on {len(target)}")
     arguments = (prepared(source), prepared(target), rigid(start), jnp.float32(GATE))
     call = lambda ours: jax.block_until_ready(ours.align(*arguments))
-    longest = max(len(source), len(target))
-    padded = stack(arguments[:2], capacity=longest)
-    both, mesh = placed(padded)
-    given = (jax.tree.map(lambda x: x[0], padded), both, *arguments[2:], mesh)
-    both_sides = lambda ours: jax.block_until_ready(ours.align_on_two(*given))
+    mesh = Mesh(np.asarray(jax.devices()), ("device",))
+    given = jax.device_put(arguments, NamedSharding(mesh, P()))
+    on_two = lambda ours: jax.block_until_ready(ours.align_on_two(*given, mesh))[0]
     runs = {}
     for name in ("icp, few first", "icp"):
-        runs[name] = partial(both_sides, OURS[name])
+        runs[name] = partial(on_two, OURS[name])
     for name, ours in OURS.items():
         runs[f"{name}, one device"] = partial(call, ours)
     center = source.mean(axis=0)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._core import GeometryError, message, safe_divide
 from ..neighbors import AbstractBackend, AbstractIndex, Neighbors, build, knn
@@ -18,11 +18,14 @@ def nearest_graph(
     *,
     backend: AbstractBackend | None = None,
     index: AbstractIndex | None = None,
+    rows: Int[Array, " m"] | None = None,
 ) -> Neighbors:
     """The k nearest points [n, k] of every point of a cloud, itself among them.
 
     `backend` finds them, see `neighbors.build`; or `index`, where that of the points is
-    built already. Status and masks are those of `neighbors.knn`; padding finds nothing.
+    built already. `rows` are the points that ask [m, k] (n for none), if not all:
+    successive ones should lie together. Status and masks are those of `neighbors.knn`;
+    padding finds nothing.
     """
     points = cloud.washed().points
     if index is None:
@@ -36,7 +39,14 @@ def nearest_graph(
                 "Pass the index that was built of this cloud, or a backend.",
             )
         )
-    return knn(index, points, k, mask=cloud.mask, groups=index.groups)
+    if rows is None:
+        return knn(index, points, k, mask=cloud.mask, groups=index.groups)
+    asking, there = (
+        jnp.asarray(x).at[rows].get(mode="fill", fill_value=0)
+        for x in (points, cloud.mask)
+    )
+    group = jnp.arange(rows.shape[0], dtype=jnp.int32)[None]
+    return knn(index, asking, k, mask=there, groups=group)
 
 
 def centered(cloud: PointCloud, near: Neighbors):

@@ -138,6 +138,10 @@ def test_frames_and_density_are_those_of_numpy():
         assert (np.asarray(x[n:]) == 0).all()
     graph = nearest_graph(cloud, 12)
     np.testing.assert_allclose(graph.distances[:n], distances, atol=1e-5)
+    rows = jnp.asarray([5, len(cloud.points), 0, 3])
+    some = nearest_graph(cloud, 12, rows=rows)
+    np.testing.assert_allclose(some.distances[::2], distances[[5, 0]], atol=1e-5)
+    assert some.mask[::2].all() and not some.mask[1].any()
 
 
 @pytest.mark.slow

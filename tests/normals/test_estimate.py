@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxgeom import GeometryError
 from jaxgeom.normals import estimate, plane_residual
 from jaxgeom.shapes import PointCloud
 
@@ -87,3 +88,54 @@ def test_the_gradient_is_finite_where_the_normal_is_not_unique():
     slope = jax.jit(jax.grad(loss))
     for points in (lattice, jnp.zeros_like(lattice)):
         assert jnp.isfinite(slope(points)).all()
+
+
+SHARED = """
+import sys
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, PartitionSpec as P
+from jaxgeom.neighbors import BruteForce
+from jaxgeom.normals import estimate
+from jaxgeom.shapes import PointCloud
+
+jax.config.update("jax_enable_x64", True)
+mesh = Mesh(np.asarray(jax.devices()), ("part",))
+points = np.random.default_rng(0).normal(size=(101, 3))
+mask = np.arange(101) % 7 != 0
+
+def alone(points, backend, axis=None):
+    cloud = PointCloud(points, mask=mask)
+    return estimate(cloud, k=9, backend=backend, axis=axis).normals
+
+def shared(points, backend):
+    run = lambda p: alone(p, backend, "part")
+    whole = dict(in_specs=P(), out_specs=P(), check_vma=False)
+    return jax.shard_map(run, mesh=mesh, **whole)(points)
+
+def both(run):
+    def weighed(points, backend):
+        normals = run(points, backend)
+        return jnp.sum(jnp.sin(normals @ jnp.asarray([1.0, 2, 3])) ** 2), normals
+
+    slope, normals = jax.jit(jax.grad(weighed, has_aux=True), static_argnums=1)(
+        points, None)
+    return slope, normals, jax.jit(run, static_argnums=1)(points, BruteForce())
+
+np.savez(sys.argv[1], *both(alone), *both(shared))
+"""
+
+
+@pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
+def test_devices_share_the_work(on_devices, count):
+    """Three are no divisor of the points, nor of the leaves of their tree."""
+    found = [*on_devices(SHARED, count).values()]
+    assert np.abs(found[0]).max() > 0.1
+    for alone, shared in zip(found[:3], found[3:], strict=True):
+        np.testing.assert_allclose(shared, alone, atol=1e-13)
+
+
+def test_an_axis_without_devices_is_an_error():
+    with pytest.raises(GeometryError, match=r"jax.shard_map .* 'part'"):
+        estimate(PointCloud(_sphere(20)), axis="part")
