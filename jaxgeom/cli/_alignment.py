@@ -83,4 +83,4 @@ def facts(found) -> dict:
 def matrix_lines(transform) -> list[str]:
     """The rows of the 4 x 4 matrix, in full precision."""
     matrix = np.asarray(transform.matrix(), np.float64)
-    return [" ".join(f"{x: .9g}" for x in row) for row in matrix]
+    return [" ".join(f"{x: .15g}" for x in row) for row in matrix]

@@ -40,8 +40,8 @@ def build(
     """The search structure of `points` [n, 3]; only those where `mask` are ever found.
 
     `backend` is `KdTree()` by default, `BruteForce()` for up to about a thousand
-    points, `CandidateLists()` for points that are searched very often, or `HostTree()`,
-    scipy's k-d tree, for a CPU.
+    points, `CandidateLists()` for the nearest one of a few thousand points that are
+    searched very often, or `HostTree()`, scipy's k-d tree, for a CPU.
     Points that are not finite are never found. Raises `GeometryError` for wrong shapes.
     """
     check_shape("points", points, (None, 3))

@@ -13,7 +13,6 @@ from .._core import RESULTS, bucket, failure_where, first_failure
 from ..clouds import thin
 from ..normals import estimate
 from ..registration import (
-    AbstractCorrespondence,
     Method,
     PreparedTarget,
     Registration,
@@ -58,9 +57,9 @@ def _oriented(cloud: PointCloud, pyramid: Pyramid) -> PointCloud:
     return estimate(cloud, k=pyramid.neighbors)
 
 
-def _prepared(cloud: PointCloud, pyramid: Pyramid, rule: AbstractCorrespondence):
+def _prepared(cloud: PointCloud, pyramid: Pyramid) -> PreparedTarget:
     """The cloud as a target; its normals, if they are needed, by the same index."""
-    target = prepare_target(cloud, rule)
+    target = prepare_target(cloud, pyramid.method.correspondence)
     if cloud.normals is not None or "target" not in pyramid.method.normals_of:
         return target
     found = estimate(target.cloud, k=pyramid.neighbors, index=target.index)
@@ -87,7 +86,7 @@ def align(
         if "source" in pyramid.method.normals_of:
             small = jax.lax.map(lambda c: _oriented(c, pyramid), small)
         source, target = (jax.tree.map(lambda x, j=j: x[j], small) for j in (0, 1))
-        target = _prepared(target, pyramid, pyramid.method.correspondence)
+        target = _prepared(target, pyramid)
         return source, target, _overflows(jnp.max(need), rooms[i])
 
     return _descend(level, voxel_size, init, rooms, pyramid)
@@ -105,13 +104,12 @@ def target_levels(
     voxel_size: Float[Array, ""],
     rooms: tuple[int | None, ...],
     pyramid: Pyramid,
-    rule: AbstractCorrespondence,
 ) -> tuple[TargetLevel, ...]:
     """The levels of a target, coarse first, each prepared by the rule of pairs."""
     out = []
     for room, share in zip(rooms, pyramid.voxels, strict=True):
         small, need = _thinned(target, share * voxel_size, room)
-        small = _prepared(small, pyramid, rule)
+        small = _prepared(small, pyramid)
         out.append(TargetLevel(small, _overflows(need, room)))
     return tuple(out)
 

@@ -23,10 +23,6 @@ from ._pyramid import (
 )
 from ._register import as_dtype, conjugated, masked
 
-# From so many scans on, it pays to prepare the target for quick searches: for 1 700
-# points that took 150 ms, and saved 7 ms a scan.
-_OFTEN = 32
-
 
 class SharedTarget(eqx.Module):
     """A target with its levels and search structures, about its center, for any number
@@ -50,11 +46,8 @@ def share_target(
 ) -> SharedTarget:
     """The target of many calls of `register_many`, prepared once (host form).
 
-    `voxel_size` and `pyramid` are those of `register`. Where the correspondence has no
-    backend of its own, candidates are listed for every place near the target: that
-    takes as long as about seven alignments, whose steps take two thirds of the time
-    afterwards.
-    Raises `GeometryError` for a target without finite points.
+    `voxel_size` and `pyramid` are those of `register`. Raises `GeometryError` for a
+    target without finite points.
     """
     pyramid = Pyramid() if pyramid is None else pyramid
     target = masked(target).trim()
@@ -71,7 +64,7 @@ def share_target(
         voxel_size = choose_voxel_size(points)
     pyramid = without_sparse_levels([points], voxel_size, pyramid)
     rooms = level_rooms([points], voxel_size, pyramid)
-    return _shared(target, voxel_size, pyramid, rooms, often=True)
+    return _shared(target, voxel_size, pyramid, rooms)
 
 
 def register_many(
@@ -115,8 +108,7 @@ def register_many(
         pyramid = without_sparse_levels(some, voxel_size, pyramid)
         rooms = level_rooms(some, voxel_size, pyramid)
     if target.points.ndim == 2:
-        often = len(sources.points) >= _OFTEN
-        shared = _shared(target, voxel_size, pyramid, rooms, often)
+        shared = _shared(target, voxel_size, pyramid, rooms)
         return _on_shared(sources, shared, init, rooms, chunk)
     center = np.stack([_mean(points) for points in _rows(target)])
     clouds = _same_size((sources, target), center)
@@ -149,21 +141,19 @@ def _check_batches(sources, target, voxel_size, pyramid):
     )
 
 
-def _shared(target, voxel_size, pyramid, rooms, often) -> SharedTarget:
+def _shared(target, voxel_size, pyramid, rooms) -> SharedTarget:
     """The levels of a masked target on the host, perhaps without points."""
     center = _mean(next(_rows(target)))
     (cloud,) = _same_size([_as_batch(target)], center[None])
-    rule = pyramid.method.correspondence
-    rule = rule.for_many() if often else rule
     size = jnp.asarray(voxel_size, cloud.points.dtype)
-    levels = _target_levels(cloud, size, rooms, pyramid, rule)
+    levels = _target_levels(cloud, size, rooms, pyramid)
     return SharedTarget(levels, center, float(voxel_size), pyramid)
 
 
 @eqx.filter_jit
-def _target_levels(batch, voxel_size, rooms, pyramid, rule):
+def _target_levels(batch, voxel_size, rooms, pyramid):
     one = jax.tree.map(lambda x: x[0], batch)
-    return target_levels(one, voxel_size, rooms, pyramid, rule)
+    return target_levels(one, voxel_size, rooms, pyramid)
 
 
 def _on_shared(sources, shared, init, rooms, chunk) -> Registration:

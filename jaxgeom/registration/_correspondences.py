@@ -4,7 +4,6 @@ A correspondence prepares the target once and is then asked again and again. Whi
 of the target it answers is a constant under differentiation; the place itself is not.
 """
 
-import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
 
@@ -17,7 +16,6 @@ from .._core import GeometryError, message, safe_divide, safe_norm, safe_normali
 from ..neighbors import (
     AbstractBackend,
     AbstractIndex,
-    CandidateLists,
     build,
     closest_on_mesh,
     knn,
@@ -109,10 +107,6 @@ class AbstractCorrespondence(eqx.Module):
     def places(self, prepared, moved: PointCloud, found: Found) -> Places:
         """Where the pairs are."""
 
-    def for_many(self) -> "AbstractCorrespondence":
-        """The same rule, for a target that is worth preparing for many scans."""
-        return self
-
     def match(
         self, prepared, moved: PointCloud, max_distance, last: Found | None = None
     ) -> Found:
@@ -145,11 +139,6 @@ class AbstractNearest(AbstractCorrespondence):
         self, moved: PointCloud, places: Places, found: Found
     ) -> Bool[Array, " n"]:
         """Which of the nearest points found make a pair."""
-
-    def for_many(self):
-        if self.backend is not None:
-            return self
-        return dataclasses.replace(self, backend=CandidateLists())
 
     def prepare(self, target):
         _check_target(target, PointCloud, "this correspondence")

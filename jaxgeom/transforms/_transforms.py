@@ -3,7 +3,8 @@
 In the plane they have 3, 4 and 6; beyond space they have no exponential map. Every
 transform acts on points as x' = M x + t, on normals as the inverse transpose of M
 (normalised), composes right to left with `@`, and is named after both its ends:
-`target_from_source`.
+`target_from_source`. One of numpy arrays, such as the doors return, keeps their double
+precision in all of this but its normals.
 """
 
 from abc import abstractmethod
@@ -56,8 +57,11 @@ class AbstractTransform(eqx.Module):
 
     def matrix(self) -> Float[Array, "d+1 d+1"]:
         """The homogeneous matrix [[M, t], [0, 1]]."""
-        top = jnp.concatenate([self.linear(), self.shift()[:, None]], axis=1)
-        return jnp.concatenate([top, jnp.eye(top.shape[1], dtype=top.dtype)[-1:]])
+        linear, shift = self.linear(), self.shift()
+        library = np if isinstance(linear, np.ndarray) else jnp
+        top = library.concatenate([linear, shift[:, None]], axis=1)
+        last = library.eye(top.shape[1], dtype=top.dtype)[-1:]
+        return library.concatenate([top, last])
 
 
 class Rigid(AbstractTransform):
@@ -218,8 +222,18 @@ class Affine(AbstractTransform):
 
     def inverse(self) -> "Affine":
         """The map back; entries are not finite for a singular matrix."""
-        back = jnp.linalg.inv(self.coefficients)
+        back = _inverse(self.coefficients)
         return Affine(back, -back @ self.translation)
+
+
+def _inverse(matrix):
+    """The inverse, not finite for a singular matrix, in the precision of the matrix."""
+    if not isinstance(matrix, np.ndarray):
+        return jnp.linalg.inv(matrix)
+    try:
+        return np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return np.full_like(matrix, np.nan)
 
 
 def _dimension(tangent, sizes: dict[int, int]) -> int:

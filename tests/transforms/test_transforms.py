@@ -56,6 +56,21 @@ def test_group_laws(group, size, x64):
     np.testing.assert_allclose(identity(points), points)
 
 
+def test_host_arrays_keep_double_precision():
+    """The pose of a scan in geographic coordinates, without `jax_enable_x64`."""
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    shift = np.array([450_000.123456789, 5_600_000.987654321, 100.25])
+    want = np.vstack([np.column_stack([turn, shift]), [0, 0, 0, 1]])
+    for map_ in (Rigid(turn, shift), Affine(turn, shift)):
+        np.testing.assert_array_equal(map_.matrix(), want)
+        back = (map_ @ map_.inverse()).matrix()
+        np.testing.assert_allclose(back, np.eye(4), atol=4e-9)
+    scaled = Similarity(np.float64(1.5), turn, shift)
+    np.testing.assert_array_equal(scaled.matrix()[:3, 3], shift)
+    gone = Affine(np.zeros((3, 3)), shift).inverse()
+    assert not np.isfinite(gone.matrix()).any(axis=1)[:3].any()
+
+
 TIMES = np.array([0.0, 1.0, 0.1, 0.4, 0.6, 0.9, 0.3, 0.7, -0.5])
 
 
