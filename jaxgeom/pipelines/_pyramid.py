@@ -171,10 +171,11 @@ def _after(value, steps):
 
 def occupied(points: Float[Array, "n 3"], side: float) -> int:
     """The number of voxels of a given side that hold points (host)."""
-    cell = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
-    spans = cell.max(axis=0) + 1
-    key = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
-    return int(np.unique(key).size)
+    columns = np.ascontiguousarray(points.T)
+    low = columns.min(axis=1, keepdims=True)
+    x, y, z = np.floor((columns - low) / side).astype(np.int64)
+    key = np.sort((x * (y.max() + 1) + y) * (z.max() + 1) + z)
+    return 1 + int(np.count_nonzero(np.diff(key)))
 
 
 def without_sparse_levels(clouds, voxel_size: float, pyramid: Pyramid) -> Pyramid:
