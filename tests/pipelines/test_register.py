@@ -20,6 +20,7 @@ from jaxgeom.pipelines import (
     register_many,
     share_target,
 )
+from jaxgeom.pipelines._pyramid import occupied
 
 # One size, two levels: all script-form tests without normals share one program.
 N, VOXEL = 1448, 0.06
@@ -224,3 +225,10 @@ def test_one_target_for_all_and_one_for_each_give_the_same_poses():
         np.testing.assert_array_equal(found.num_steps[:4], paired.num_steps[:4])
         shifts = [x.target_from_source.translation[:4] for x in (found, paired)]
         np.testing.assert_allclose(*shifts, atol=2e-6)
+
+
+@pytest.mark.parametrize("side", [0.02, 0.3, 50.0])
+def test_occupied_voxels_are_counted(side):
+    points = np.random.default_rng(0).normal(size=(3000, 3)) * [3, 1, 0.2] + 1e5
+    cells = np.floor((points - points.min(axis=0)) / side)
+    assert occupied(points, side) == len(np.unique(cells, axis=0))
