@@ -87,7 +87,7 @@ def local_normals(cloud: PointCloud, near: Neighbors) -> Float[Array, "m 3"]:
     there = near.mask.T
     rows, count = jnp.where(there, near.indices.T, 0), jnp.sum(there, axis=0)
     only = lambda x: jnp.where(there, x, 0)
-    # Summed row by row: XLA on a CPU takes three times as long for `jnp.sum`.
+    # Summed row by row: XLA on a CPU takes up to three times as long for `jnp.sum`.
     mean = lambda x: sum(x) / jnp.maximum(count, 1).astype(x.dtype)
     columns = [x[rows] for x in jnp.asarray(cloud.washed().points).T]
     gaps = [only(x - x[0]) for x in columns]
